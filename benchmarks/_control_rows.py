@@ -7,7 +7,8 @@ import numpy as np
 from _timing import Table, side_by_side
 from scipy.linalg import expm
 
-from microid import PID, Driver, Mechanics, Piezo, Stage, simulate_loop
+from microid import Driver, Mechanics, Piezo, Stage
+from microid.control import PID, simulate_loop
 
 _TIME_CONSTANT_s, _NATURAL_Hz, _DAMPING, _GAIN = 8e-4, 420.0, 0.1, 0.12
 _INTERVAL_s = 1e-4

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import data_synth
-from microid import GridDensity, Preisach, Reversible, node_areas
+from microid import Preisach, Reversible
+from microid.densities import GridDensity, node_areas
 
 BENCH = Path(__file__).parents[2] / "shared" / "bench"
 RECORD = BENCH / "data" / "fit_preisach.npz"

@@ -10,7 +10,7 @@ import numpy as np
 from _timing import Line, Table, side_by_side
 
 import fits
-from microid import Axis
+from microid.kinetostatics import Axis
 
 _TOLERANCE_mm, _GUIDES = 0.02, 4.0
 _ROOT_AXIAL, _ROOT, _SHEAR = 2.18, 0.80, 2 * 1.29 * 6 / 5

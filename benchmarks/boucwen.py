@@ -20,6 +20,7 @@ from scipy.io import loadmat
 import data_synth
 import fits
 import microid as m
+from microid.hysteresis import BoucWen
 
 jax.config.update("jax_enable_x64", True)
 
@@ -27,7 +28,7 @@ OFFICIAL = Path(__file__).parents[1].parent / "shared" / "data" / "boucwen"
 INTERVAL_s, NOISE_um, FINEST = 1 / data_synth.BOUCWEN_RATE_HZ, 8.0, 20
 
 
-def oscillator(gain_um_per_N: float, natural_frequency_Hz: float, damping_ratio: float, law: m.BoucWen) -> m.Stage:
+def oscillator(gain_um_per_N: float, natural_frequency_Hz: float, damping_ratio: float, law: BoucWen) -> m.Stage:
     """A force in N in the place of the voltage, a displacement in um; what cannot be seen is frozen."""
     stage = m.Stage.of(
         hold="smooth",
@@ -71,7 +72,7 @@ def main() -> None:
     force_N = np.stack([data_synth.boucwen_multisine(50.0, rng) for _ in range(options.realizations)])
     clean_um = np.stack([1e6 * data_synth.boucwen_response(one) for one in force_N])
     begin = time.perf_counter()
-    start = oscillator(25.0, 26.0, 0.03, m.BoucWen(0.0, 1.3, 5e-4, 0.0))
+    start = oscillator(25.0, 26.0, 0.03, BoucWen(0.0, 1.3, 5e-4, 0.0))
     time_s = INTERVAL_s * np.arange(force_N.shape[1])
     records = [
         fits.Record(time_s, force, clean + rng.normal(0, NOISE_um, clean.shape), source=f"realization {k + 1}")
@@ -86,7 +87,7 @@ def main() -> None:
 
     stiffness = truth.stiffness_N_per_m
     linear = m.Mechanics.from_mass(truth.mass_kg, stiffness, truth.damping_N_s_per_m)
-    law = m.BoucWen(
+    law = BoucWen(
         0.0, truth.alpha_N_per_m / stiffness, 1e-6 * truth.beta * truth.gamma, 1e-6 * truth.beta * truth.delta
     )
     exact = oscillator(1e6 / stiffness, float(linear.natural_frequency_Hz), float(linear.damping_ratio), law)

@@ -15,6 +15,7 @@ from microid._platform import _by_platform
 from microid._precision import _full_precision
 
 Hold = Literal["first", "zero", "smooth"]
+"""How an input goes between samples: in a line, in a step that holds the last one, or in a smooth curve."""
 Times = Float[Array, " t"] | Float[Array, ""]
 # With a norm of at most a half, sixteen terms of the exponential series leave less than rounding.
 _TERMS = 16

@@ -49,6 +49,11 @@ def options_of(command):
     return [each for each in command.params if isinstance(each, click.Option)]
 
 
+def _coded(text):
+    """Help with its options as code, whose two hyphens a site would show as a dash."""
+    return re.sub(r"(?<![\w`-])--[a-z][a-z-]*", r"`\g<0>`", text)
+
+
 def _row(option):
     if option.metavar:
         kind = f" {option.metavar}"
@@ -59,7 +64,7 @@ def _row(option):
         kind = "" if option.is_flag else " N" if number else " NAME"
     text = option.help + (f" Default: {option.default}." if option.show_default else "")
     label = f"{' / '.join(option.opts)}{kind}".replace("|", " or ")
-    return f"| `{label}` | {text.replace('|', ' or ')} |"
+    return f"| `{label}` | {_coded(text.replace('|', ' or '))} |"
 
 
 def _table(options):
@@ -74,7 +79,7 @@ def reference_page():
         usage = command.collect_usage_pieces(click.Context(command, info_name=name))
         lines += ["", f"## microid {name}", "", f"`microid {name} {' '.join(usage)}`"]
         for paragraph in command.help.split("\n\n"):
-            lines += ["", textwrap.fill(" ".join(paragraph.split()), 118, break_on_hyphens=False)]
+            lines += ["", textwrap.fill(_coded(" ".join(paragraph.split())), 118, break_on_hyphens=False)]
         own = [option for option in options_of(command) if option.name not in SHARED]
         also = [f"`{option.opts[-1]}`" for option in options_of(command) if option.name in SHARED]
         lines += _table(own) + (["", f"Also: {', '.join(also)}."] if also else [])

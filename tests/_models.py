@@ -20,7 +20,7 @@ compiled = functools.partial(eqx.filter_jit, compiler_options={"xla_backend_opti
 def random_model(rng, levels=LEVELS):
     """A grid of random weights over a random range, no two alike."""
     lower_V, upper_V = rng.uniform(-30, 5), rng.uniform(60, 150)
-    density = m.GridDensity(rng.exponential(0.3, levels * (levels + 1) // 2), lower_V, upper_V)
+    density = m.densities.GridDensity(rng.exponential(0.3, levels * (levels + 1) // 2), lower_V, upper_V)
     reversible = m.Reversible(rng.uniform(0.05, 0.4, levels), lower_V, upper_V)
     return m.Preisach(density, reversible, rng.normal(0, 5))
 

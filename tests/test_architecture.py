@@ -203,7 +203,7 @@ def everything(model, voltage):
         model.reversible(voltage[None]), model.density.levels_V, memory.end(5),
     )
 
-for name, family in m.FAMILIES.items():
+for name, family in m.densities.FAMILIES.items():
     density = family.start(lower, upper, 6, stroke, jax.random.key(0))
     model = m.Preisach(density, m.Reversible(jnp.ones(6), -1.0, 9.0), 0.5)
     eqx.filter_eval_shape(everything, model, voltage)

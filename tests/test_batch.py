@@ -14,7 +14,7 @@ def stages_of(rng, rows, hold, shared):
     """Stages as rows of their arrays, whose hysteresis differs from row to row or is one for all."""
 
     def law():
-        density = m.GridDensity(rng.uniform(0, 1, 15), 0.0, 100.0)
+        density = m.densities.GridDensity(rng.uniform(0, 1, 15), 0.0, 100.0)
         return m.Preisach(density, m.Reversible(rng.uniform(0, 0.1, 5), 0.0, 100.0), rng.uniform(-1, 1))
 
     def joined(parts):
@@ -48,7 +48,7 @@ def test_rows_may_differ_in_the_offset_alone(rng):
 
 
 def test_other_parts_are_mapped_over_the_rows(rng):
-    law = m.Dahl(*(jnp.asarray(rng.uniform(0.1, 1.0, 2)) for _ in range(4)))
+    law = m.hysteresis.Dahl(*(jnp.asarray(rng.uniform(0.1, 1.0, 2)) for _ in range(4)))
     voltage = jnp.asarray(rng.uniform(0, 10, (2, 30)))
     found = jax.jit(m.respond_all)(m.Stage((law,), ("law",)), 1e-3, voltage)
     for row in range(2):

@@ -51,7 +51,7 @@ def test_the_benchmark_is_written_as_files(tmp_path):
 def test_the_benchmark_from_its_files_to_c(tmp_path):
     """Fit, model file, simulation and C by the command alone, judged on the sweep, which is without noise."""
     assert run("synth", "boucwen", "--out", tmp_path, "--samples", 2000, "--seed", 5).exit_code == 0
-    mechanics = m.HystereticMechanics(m.Mechanics(26.0, 0.03), m.BoucWen(0.0, 1.3, 5e-4, 0.0))
+    mechanics = m.HystereticMechanics(m.Mechanics(26.0, 0.03), m.hysteresis.BoucWen(0.0, 1.3, 5e-4, 0.0))
     alike = "force.offset_um", "mechanics.inner.gain", *(f"mechanics.law.{name}" for name in UNSEEN)
     start, fitted = tmp_path / "start.json", tmp_path / "fitted.json"
     fits.save_model(start, m.Stage.of(force=m.Piezo(25.0), mechanics=mechanics).freeze(*alike), None, {})

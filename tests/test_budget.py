@@ -246,5 +246,5 @@ def test_bad_input_ends_in_one_sentence(folder, monkeypatch, arguments, words):
 
 def test_choices_in_the_help_are_those_of_the_library():
     options = {option.name: option for option in cli.commands["budget"].params}
-    assert tuple(options["axis"].type.choices) == (*m.AXES, "all")
+    assert tuple(options["axis"].type.choices) == (*m.kinetostatics.AXES, "all")
     assert tuple(options["model_measures"].type.choices) == typing.get_args(fits.machining._budget.Measures)

@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("control")
     linear = linear_stage_of((TAU_s, NATURAL_Hz, DAMPING), GAIN, OFFSET)
     save_model(place / "linear.json", linear, None, {})
-    density = m.GridDensity(np.linspace(0.2, 0.8, 15), 0.0, 100.0)
+    density = m.densities.GridDensity(np.linspace(0.2, 0.8, 15), 0.0, 100.0)
     law = m.Preisach(density, m.Reversible(jnp.full(5, 0.05), 0.0, 100.0), jnp.asarray(2.0))
     save_model(place / "loop.json", law, None, {})
     save_model(place / "slew.json", m.Stage.of(slew=SlewLimit(1e4), piezo=m.Piezo(0.1)), None, {})
@@ -317,7 +317,7 @@ def test_references_that_stand_still_are_told_of_and_those_that_overflow_refused
 def test_choices_in_the_help_are_those_of_the_library():
     (kinds,) = (option.type.choices for option in cli.commands["control"].params if option.name == "controller")
     assert kinds[0] == "pid"
-    assert sorted(kinds) == sorted(m.CONTROLLERS)
+    assert sorted(kinds) == sorted(m.control.CONTROLLERS)
 
 
 @pytest.mark.study

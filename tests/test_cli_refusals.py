@@ -8,7 +8,7 @@ from test_foreign_files import rows, signals
 
 from fits import FitError, FitStatus, read_table
 from fits.io._units import parse_columns
-from microid import FAMILIES
+from microid.densities import FAMILIES
 
 
 def write_csv(path, time_s, voltage_V, displacement_um):

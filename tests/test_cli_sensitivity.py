@@ -8,9 +8,9 @@ import pytest
 from _command import files, refused, run
 
 import fits
-import microid as m
 from fits.cli._main import cli
 from fits.report._machining import sensitivity_json
+from microid import kinetostatics as ks
 
 
 def told(*options):
@@ -155,6 +155,6 @@ def test_bad_input_ends_in_one_sentence(stage, monkeypatch, options, words):
 
 def test_choices_in_the_help_are_those_of_the_library():
     options = {option.name: option for option in cli.commands["sensitivity"].params}
-    assert tuple(options["axis"].type.choices) == (*m.AXES, "all")
+    assert tuple(options["axis"].type.choices) == (*ks.AXES, "all")
     assert run("sensitivity", "--axis", "w").exit_code == 2
     assert run("sensitivity", "--level", "2").exit_code == 2

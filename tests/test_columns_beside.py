@@ -7,8 +7,9 @@ import pytest
 import fits
 from fits.diagnosis._experiment import further_column
 from fits.io.columns import COLUMNS, columns_beside
-from microid import Dahl, Driver, Mechanics, Sensor, Stage
+from microid import Driver, Mechanics, Sensor, Stage
 from microid.effects import EFFECTS, extend
+from microid.hysteresis import Dahl
 
 
 def record(rng, **extra):

@@ -14,6 +14,7 @@ from test_compensate import read
 
 import microid
 from fits import DataError, Reference, compensate, save_model
+from microid.hysteresis import PrandtlIshlinskii
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 SAMPLES, HALF = 400, 200
@@ -121,7 +122,7 @@ def test_what_a_stage_cannot_follow_is_refused_or_said(rng):
     with pytest.raises(DataError, match="dynamically"):
         compensate(stage["hysteresis"], wanted, way="dynamic")
     with pytest.raises(DataError, match=r"plays.*hysteresis"):
-        compensate(microid.Stage.of(plays=microid.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)), wanted)
+        compensate(microid.Stage.of(plays=PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)), wanted)
     turned = stage.swap("sensor", microid.Sensor(-1.0, 0.0))
     with pytest.raises(DataError, match=r"'sensor'.*positive"):
         compensate(turned, wanted)
@@ -175,3 +176,15 @@ def test_the_command_takes_stages(rng, tmp_path):
     inverse.argtypes, inverse.restype = [ctypes.c_void_p, ctypes.c_double], ctypes.c_double
     found_V = [inverse(state, value) for value in wanted.displacement_um.tolist()]
     np.testing.assert_allclose(found_V, voltage_V, rtol=0, atol=1e-8)
+
+
+def test_what_is_out_of_reach_beside_an_effect_is_not_said_of_the_reference(rng):
+    # A creep that goes on: towards the end the plain stage is to be lower than it can be.
+    creep = next(one for one in microid.effects.EFFECTS if one.name == "creep")
+    law = random_model(rng, 12)
+    stage = microid.effects.extend(microid.Stage.of(hysteresis=law), creep(0.2, 0.05))
+    low, high = ends_um(law)
+    time_s = np.linspace(0, 2, 400)
+    there = Reference(time_s, low + (high - low) * 0.8 * np.clip(np.minimum(time_s, 2 - time_s), 0, 0.5), "r.csv")
+    with pytest.raises(DataError, match=r"r\.csv, less what the effects of the model add: .* asks for .* clipped"):
+        compensate(stage, there)

@@ -76,7 +76,7 @@ def test_a_full_memory_forgets_the_smallest_loops(rng):
 
 
 def prandtl(rng):
-    return m.PrandtlIshlinskii(0.05, rng.uniform(0, 0.05, 4), rng.uniform(1, 40, 4), 3.0)
+    return m.hysteresis.PrandtlIshlinskii(0.05, rng.uniform(0, 0.05, 4), rng.uniform(1, 40, 4), 3.0)
 
 
 def stages(rng):

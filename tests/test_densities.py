@@ -33,12 +33,12 @@ def node_integrals(levels):
 
 def make_grid(rng):
     packed_um = rng.exponential(0.3, LEVELS * (LEVELS + 1) // 2)
-    return m.GridDensity(packed_um, LOWER_V, UPPER_V)
+    return m.densities.GridDensity(packed_um, LOWER_V, UPPER_V)
 
 
 def make_mixture(rng):
     k = 3
-    return m.MixtureDensity(
+    return m.densities.MixtureDensity(
         weight_um=rng.uniform(1, 20, k),
         bias=rng.uniform(0, 1, k),
         spread=rng.uniform(0.1, 0.6, k),
@@ -52,7 +52,7 @@ def make_mixture(rng):
 
 def make_network(rng):
     key = jax.random.key(int(rng.integers(2**31)))
-    return m.NetworkDensity.start(jnp.array(LOWER_V), jnp.array(UPPER_V), LEVELS, jnp.array(12.0), key)
+    return m.densities.NetworkDensity.start(jnp.array(LOWER_V), jnp.array(UPPER_V), LEVELS, jnp.array(12.0), key)
 
 
 def grid_nodes(density):
@@ -111,8 +111,8 @@ def corners(rng):
 
 def test_every_file_of_the_package_is_a_family_with_a_test():
     files = {module.name for module in pkgutil.iter_modules(microid.densities.__path__) if module.name[0] != "_"}
-    assert set(m.FAMILIES) == files == set(MAKERS)
-    assert {type(make(np.random.default_rng(0))) for make in MAKERS.values()} == set(m.FAMILIES.values())
+    assert set(m.densities.FAMILIES) == files == set(MAKERS)
+    assert {type(make(np.random.default_rng(0))) for make in MAKERS.values()} == set(m.densities.FAMILIES.values())
 
 
 @pytest.mark.parametrize("family", MAKERS)
@@ -150,8 +150,8 @@ def test_weights_of_a_grid_are_what_was_packed(rng):
     density = make_grid(rng)
     weights_um = np.asarray(read(density, *corners(rng))[1])
     np.testing.assert_allclose(weights_um[np.tril_indices(LEVELS)], density.packed_um, rtol=1e-14)
-    np.testing.assert_allclose(m.node_areas(LEVELS), node_integrals(LEVELS), rtol=1e-13, atol=1e-16)
-    assert m.node_areas(2).sum() == pytest.approx(0.5)
+    np.testing.assert_allclose(m.densities.node_areas(LEVELS), node_integrals(LEVELS), rtol=1e-13, atol=1e-16)
+    assert m.densities.node_areas(2).sum() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("family", MAKERS)
@@ -189,7 +189,7 @@ def test_derivatives_of_the_nodes_are_central_differences(family, rng):
 @pytest.mark.parametrize("family", MAKERS)
 def test_a_fit_can_start_from_a_drawn_density(family, rng):
     keys = [jax.random.key(int(k)) for k in rng.integers(2**31, size=2)]
-    start = m.FAMILIES[family].start
+    start = m.densities.FAMILIES[family].start
     drawn = [start(jnp.array(LOWER_V), jnp.array(UPPER_V), LEVELS, jnp.array(12.0), key) for key in keys]
     weights_um = [np.asarray(read(density, *corners(rng))[1]) for density in drawn]
     assert (drawn[0].levels, float(drawn[0].lower_V), float(drawn[0].upper_V)) == (LEVELS, LOWER_V, UPPER_V)
@@ -203,24 +203,24 @@ def test_a_fit_can_start_from_a_drawn_density(family, rng):
 @pytest.mark.parametrize("count", [0, 1, 2, 4, 5, 7])
 def test_weights_that_fill_no_triangle_are_refused(count):
     with pytest.raises(ValueError, match=f"{count} weights fill no triangle"):
-        m.GridDensity(np.ones(count), LOWER_V, UPPER_V)
+        m.densities.GridDensity(np.ones(count), LOWER_V, UPPER_V)
 
 
 def test_families_are_registered_under_the_names_of_their_files():
     def family(name, module):
         return type("Some", (), {"family": name, "__module__": f"elsewhere.{module}"})
 
-    before = dict(m.FAMILIES)
+    before = dict(m.densities.FAMILIES)
     with pytest.raises(ValueError, match=r"Some.family is 'one', but its file is called 'other'"):
         microid.densities.register(family("one", "other"))
     with pytest.raises(ValueError, match="its file is called 'nameless'"):
         microid.densities.register(type("Some", (), {"__module__": "nameless"}))
     with pytest.raises(ValueError, match="'grid' is defined twice"):
         microid.densities.register(family("grid", "grid"))
-    assert before == m.FAMILIES
+    assert before == m.densities.FAMILIES
     new = family("one", "one")
     try:
         assert microid.densities.register(new) is new
-        assert m.FAMILIES["one"] is new
+        assert m.densities.FAMILIES["one"] is new
     finally:
-        m.FAMILIES.pop("one", None)
+        m.densities.FAMILIES.pop("one", None)

@@ -25,7 +25,8 @@ from fits.stage._fit import default_stage
 from fits.stage._moments import Chain, offsets_out
 from fits.stage._run import place_of_hysteresis
 from fits.stats._noise import Noise
-from microid import EFFECTS, Sensor
+from microid import Sensor
+from microid.effects import EFFECTS
 from microid.effects.aging import Aging
 from microid.effects.voltage_dependent_capacitance import VoltageDependentCapacitance
 

@@ -21,7 +21,8 @@ from fits.stage._motion import program
 from fits.stats._band import band_of
 from fits.stats._compare import surprise
 from fits.stats._noise import Noise, learn_noise
-from microid import EFFECTS, AbstractPart, Scene, Signal
+from microid import AbstractPart, Scene, Signal
+from microid.effects import EFFECTS
 
 WHITE = np.zeros(0)
 

@@ -18,7 +18,8 @@ from fits.diagnosis._regression import regress
 from fits.diagnosis._select import Explanation, _best
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._noise import Noise
-from microid import EFFECTS, Driver
+from microid import Driver
+from microid.effects import EFFECTS
 
 STEP_S, COUNT = 0.01, 3300
 

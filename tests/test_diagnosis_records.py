@@ -10,7 +10,7 @@ from fits import Record
 from fits.diagnosis._effects import Law
 from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._score import _is_allowed
-from microid import EFFECTS, Scales
+from microid.effects import EFFECTS, Scales
 
 
 def record(count, cycle, source="long.csv"):

@@ -44,7 +44,7 @@ def scales():
 
 def plain_stage():
     """All kinds of parts; the law's loop is 2 um wide."""
-    law = m.Dahl(0.2, 1.0, 8.0, 1.0)
+    law = m.hysteresis.Dahl(0.2, 1.0, 8.0, 1.0)
     return m.Stage.of(driver=m.Driver(8e-4), hysteresis=law, mechanics=m.Mechanics(100.0, 0.05), sensor=m.Sensor())
 
 

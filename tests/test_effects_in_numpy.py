@@ -22,7 +22,7 @@ from fits.stage._moments import offsets_out
 from fits.stage._plain_stage import plain_model
 
 SAMPLES, INTERVAL_s, TINY, EXACT = 300, 1e-3, 1e-30, 1e-12
-FORMS = [effect for effect in m.EFFECTS if hasattr(effect, "in_numpy")]
+FORMS = [effect for effect in m.effects.EFFECTS if hasattr(effect, "in_numpy")]
 BY_NAME = {effect.__name__: effect for effect in FORMS}
 
 

@@ -154,7 +154,7 @@ def test_accommodation_feeds_the_irreversible_part_back(rng):
     truth = plain
     for _ in range(12):
         truth = dahl(path + 0.4 * (truth - mean))
-    law = m.Dahl(0.2, 1.0, 8.0)
+    law = m.hysteresis.Dahl(0.2, 1.0, 8.0)
     found = through(BY_NAME["accommodation", ""](law, 0.4), 1e-3, path)
     assert np.max(np.abs(truth - plain)) > 0.03
     np.testing.assert_allclose(found, truth, atol=0.05 * np.max(np.abs(truth - plain)))
@@ -165,7 +165,7 @@ def test_rate_dependence_widens_loops_by_the_decade(rng):
     path = 100 * np.abs((np.arange(1200) / 300 + 1) % 2 - 1)
     interval = 100 / 300 / rate
     plain = dahl(path)
-    law = m.Dahl(0.2, 1.0, 8.0)
+    law = m.hysteresis.Dahl(0.2, 1.0, 8.0)
     found = through(BY_NAME["rate_dependence", ""](law, 0.07, onset), interval, path)
     wider = 0.07 * np.log10(1 + rate / onset) * (plain - branches(path)(path))
     # The mean of the loop is a line between levels, and at turns the rate is not what it is around them.

@@ -29,8 +29,8 @@ def test_levels_converge_to_a_smooth_density_at_second_order(rng):
     for n in sizes:
         levels_V = np.linspace(0.0, 120.0, n)
         nodes = smooth(levels_V[:, None], levels_V)
-        packed_um = (nodes * m.node_areas(n))[np.tril_indices(n)] * 120.0**2
-        model = m.Preisach(m.GridDensity(packed_um, 0.0, 120.0), m.Reversible(np.zeros(n), 0.0, 120.0), 0.0)
+        packed_um = (nodes * m.densities.node_areas(n))[np.tril_indices(n)] * 120.0**2
+        model = m.Preisach(m.densities.GridDensity(packed_um, 0.0, 120.0), m.Reversible(np.zeros(n), 0.0, 120.0), 0.0)
         errors_um.append(np.linalg.norm(lost_um(model, high_V, low_V) - exact_um))
     order = -np.polyfit(np.log(np.array(sizes) - 1), np.log(errors_um), 1)[0]
     print(f"order {order:.3f}, errors {errors_um} um of 20 um")

@@ -59,7 +59,7 @@ def yielding(rng, law, **around):
 def test_it_moves_as_adaptive_integration_does(rng, tmp_path, hold):
     """A driver that lags, a Bouc-Wen oscillator and a sensor, from rest; a command in lines and one in steps."""
     beta, gamma, stiffness = rng.uniform(0.02, 0.05), rng.uniform(-0.01, 0.01), rng.uniform(0.5, 1.0)
-    law = m.BoucWen(0.0, stiffness, beta, gamma, 1.0, 0.0, 1)
+    law = m.hysteresis.BoucWen(0.0, stiffness, beta, gamma, 1.0, 0.0, 1)
     stage = yielding(rng, law, driver=m.Driver(2e-3, 0.8)).append("sensor", m.Sensor(1.1, 3.0))
     driver, piezo, mechanics, _ = stage.parts
     inner = mechanics.inner
@@ -95,7 +95,7 @@ def law_of(rng, name):
     """A random law, and a Preisach operator as wide as the motion."""
     if name != "preisach":
         return random_laws(rng)[name][0]
-    density = m.GridDensity(rng.exponential(0.03, LEVELS * (LEVELS + 1) // 2), -200.0, 200.0)
+    density = m.densities.GridDensity(rng.exponential(0.03, LEVELS * (LEVELS + 1) // 2), -200.0, 200.0)
     return m.Preisach(density, m.Reversible(np.full(LEVELS, 0.1), -200.0, 200.0), rng.normal())
 
 

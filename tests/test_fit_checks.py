@@ -2,12 +2,14 @@
 
 import re
 from html import unescape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from _wrong_records import bench, delayed, in_ms, joined, read, said, stuck, thinned, with_outliers
 
 import fits
+from fits.loop._fit import _of_speed
 from fits.loop._misfit import impulsive, sensor_noise_um
 from fits.loop._misfit import stuck as told_stuck
 
@@ -162,3 +164,18 @@ def test_the_first_way_of_a_fresh_stage_is_named(rng):
         if fresh:
             stop = int(re.search(r"^rig\.csv: up to sample (\d+) ", found[0])[1])
             assert np.argmax(voltage_V > 95) <= stop <= np.argmax(voltage_V)
+
+
+def test_runs_of_other_speeds_that_are_far_from_noise_ask_for_the_stage():
+    def moved(rate_V_per_s, n=400):
+        time_s = np.arange(n) * 0.1 / rate_V_per_s
+        drive_V = 50 - 50 * np.cos(2 * np.pi * time_s / time_s[-1] * 2)
+        return SimpleNamespace(record=SimpleNamespace(time_s=time_s, voltage_V=drive_V))
+
+    (said,) = _of_speed([moved(1.0), moved(40.0), moved(3.0)])
+    assert "by a factor of 40," in said
+    assert "whole stage" in said
+    # A run at rest has no speed, and one or two alike tell nothing of it.
+    still = moved(1.0)
+    still.record.voltage_V = np.zeros(400)
+    assert _of_speed([moved(1.0), still]) == _of_speed([moved(1.0), moved(4.0)]) == []

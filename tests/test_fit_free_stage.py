@@ -41,7 +41,7 @@ def oscillator_record(rng, source="run.csv", samples=900):
 
 def yielding(beta=0.1, gamma=0.0):
     """A start some way off; what is only seen together with something else is frozen, but for one of two gains."""
-    law = m.BoucWen(0.0, 0.6, beta, gamma, substeps=1)
+    law = m.hysteresis.BoucWen(0.0, 0.6, beta, gamma, substeps=1)
     mechanics = m.HystereticMechanics(m.Mechanics(24.0, 0.1, 1.25), law)
     return m.Stage.of(piezo=m.Piezo(0.2), mechanics=mechanics).freeze(
         "mechanics.law.slope_um_per_V", "mechanics.law.exponent"
@@ -116,7 +116,7 @@ def test_plays_ahead_of_mechanics_are_found_wherever_the_poles_begin(rng):
     clean_um = linear_displacement(fine_s, driven_um, 1e-9, 120.0, 0.05, 1.0)[::finer]
     record = fits.Record(time_s, voltage_V, clean_um + 3.0 + 0.02 * rng.standard_normal(n), source="plays.csv")
 
-    law = m.PrandtlIshlinskii(0.15, np.array([0.08, 0.08]), np.array([1.0, 10.0]), 0.0)
+    law = m.hysteresis.PrandtlIshlinskii(0.15, np.array([0.08, 0.08]), np.array([1.0, 10.0]), 0.0)
     stage = m.Stage.of(hysteresis=law, mechanics=m.Mechanics(20.0, 0.5)).freeze("mechanics.gain")
     found = fits.fit_stage(record, stage=stage, initial="negative")
     truth = [0.2, *weight, *threshold_V, 120.0, 0.05]

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from _command import run
 from _wrong_records import said
 from scipy import signal
 
 import fits
+import microid as m
 
 RATE_Hz, LAG_s, FINE = 10_000.0, 0.55e-3, 40
 
@@ -45,3 +47,12 @@ def test_a_lag_is_found_whatever_came_before(rng, frequencies_Hz, periods):
     assert result["driver.time_constant_s"].value == pytest.approx(LAG_s, rel=0.01)
     assert result.held_out.e_rms_pct < 0.02
     assert not any("neighbouring residuals" in remark for remark in result.remarks)
+
+
+def test_a_linear_stage_is_fitted_to_a_run_with_hysteresis(tmp_path):
+    # What no linear stage follows changes slowly, over hundreds of samples, and hides what the mode does.
+    assert run("synth", "stage", "--out", tmp_path).exit_code == 0
+    stage = m.Stage.of(driver=m.Driver(1e-3), piezo=m.Piezo(0.3), mechanics=m.Mechanics(100.0, 0.1))
+    found = fits.fit_stage([tmp_path / "fast.csv"], stage=stage.freeze("driver.gain", "mechanics.gain"))
+    # Of that rig; that of a linear stage is of no rig, so that no interval is asked for.
+    assert found["mechanics.natural_frequency_Hz"].value == pytest.approx(180.0, rel=0.03)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from _models import compiled
 
-import microid as m
+from microid import kinetostatics as ks
 
 GEOMETRIES = 100
 SHEAR = 3.1
@@ -152,8 +152,8 @@ def drawn(rng, count=GEOMETRIES):
 def stage(drawn):
     """The same as arguments of `compared`, with all sizes along one axis."""
     dimensions, width, modulus, guides = drawn
-    sizes = {m.DIMENSIONS[name].field: jnp.asarray([d[name] for d in dimensions]) for name in dimensions[0]}
-    geometry = m.Geometry(**sizes, d_mm=jnp.asarray(width), h_mm=jnp.asarray(width))
+    sizes = {ks.DIMENSIONS[name].field: jnp.asarray([d[name] for d in dimensions]) for name in dimensions[0]}
+    geometry = ks.Geometry(**sizes, d_mm=jnp.asarray(width), h_mm=jnp.asarray(width))
     return geometry, jnp.asarray(modulus), jnp.asarray(guides, dtype=float)
 
 
@@ -162,9 +162,11 @@ def compared(geometry, modulus_MPa, guides, shear):
     """Gains and input stiffnesses of all axes, for each of many geometries."""
 
     def one(g, modulus, guides):
-        constants = m.constants_of(g, level=0, youngs_modulus_MPa=modulus, guides=guides)
+        constants = ks.constants_of(g, level=0, youngs_modulus_MPa=modulus, guides=guides)
         constants = eqx.tree_at(lambda c: c.shear, constants, shear)
-        return {axis: (m.gain(axis, g, constants), m.input_stiffness_N_per_um(axis, g, constants)) for axis in m.AXES}
+        return {
+            axis: (ks.gain(axis, g, constants), ks.input_stiffness_N_per_um(axis, g, constants)) for axis in ks.AXES
+        }
 
     return eqx.filter_vmap(one)(geometry, modulus_MPa, guides)
 
@@ -199,8 +201,8 @@ def test_shear_is_that_of_timoshenkos_beams(rng):
 def test_a_bridge_is_the_frames_two_port(rng):
     names = ("l1", "t1", "la1", "alpha1")
     for d in drawn(rng, 10)[0]:
-        constants = m.constants_of(m.Geometry(), level=0)
-        port = m.bridge(*(jnp.asarray(d[name]) for name in names), constants)
+        constants = ks.constants_of(ks.Geometry(), level=0)
+        port = ks.bridge(*(jnp.asarray(d[name]) for name in names), constants)
         off = -port.K12_N_per_um
         found = np.array([[port.K11_N_per_um, off], [off, port.K22_N_per_um]])
         close(found, fe.two_port_N_per_um(*(d[name] for name in names)))
@@ -212,10 +214,10 @@ def test_a_bridge_is_the_frames_two_port(rng):
     [("x", 7.163123807743204), ("z", 9.58228792749674), ("alpha", 107.30040541951), ("gamma", 526.369312718)],
 )
 def test_the_papers_stage_has_the_gains_on_record(axis, recorded):
-    geometry = m.Geometry()
-    dimensions = {name: float(geometry[name]) for name in m.DIMENSIONS}
+    geometry = ks.Geometry()
+    dimensions = {name: float(geometry[name]) for name in ks.DIMENSIONS}
     linear = fe.gain(axis, dimensions)
-    close(m.gain(axis, geometry, m.constants_of(geometry, level=0)), linear)
+    close(ks.gain(axis, geometry, ks.constants_of(geometry, level=0)), linear)
     # On record are angles; small strokes give the tangent of the tilt and the sine of the rotation.
     turned = {"alpha": np.tan, "gamma": np.sin}
     close(linear, turned[axis](1e-6 * recorded) if axis in turned else recorded, rtol=1e-11)

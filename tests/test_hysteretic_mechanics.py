@@ -16,6 +16,7 @@ from test_laws import random_laws
 
 import data_synth
 import microid as m
+from microid.hysteresis import BoucWen, MaxwellSlip, PrandtlIshlinskii
 
 OFFICIAL = ROOT.parent / "shared" / "data" / "boucwen"
 T, SAMPLES = 1e-3, 160
@@ -67,7 +68,7 @@ def integrated_um(stage, law_rate, voltage_V):
 def test_motion_is_that_of_adaptive_integration(rng):
     beta, gamma = rng.uniform(0.02, 0.05), rng.uniform(-0.01, 0.01)
     stiffness = rng.uniform(0.5, 1.0)
-    law = m.BoucWen(0.0, stiffness, beta, gamma, 1.0, 0.0, 1)
+    law = BoucWen(0.0, stiffness, beta, gamma, 1.0, 0.0, 1)
     mechanics = m.HystereticMechanics(m.Mechanics(rng.uniform(30, 50), rng.uniform(0.03, 0.1)), law)
     stage = m.Stage.of(piezo=m.Piezo(0.2), mechanics=mechanics)
     time_s = np.arange(SAMPLES) * T
@@ -88,7 +89,7 @@ def test_motion_is_that_of_adaptive_integration(rng):
 
 def test_a_spring_that_does_not_yield_is_that_of_linear_mechanics(rng):
     linear = m.Mechanics(rng.uniform(50, 100), rng.uniform(0.01, 0.3))
-    stiff = m.HystereticMechanics(linear, m.MaxwellSlip(0.0, np.full(2, 1e-9), np.ones(2), 0.0))
+    stiff = m.HystereticMechanics(linear, MaxwellSlip(0.0, np.full(2, 1e-9), np.ones(2), 0.0))
     stages = [m.Stage.of(piezo=m.Piezo(0.3), mechanics=part) for part in (linear, stiff)]
     voltage_V = jnp.asarray(np.cumsum(rng.normal(0, 5, SAMPLES)))
     expected, found = (respond(stage, voltage_V) for stage in stages)
@@ -96,7 +97,7 @@ def test_a_spring_that_does_not_yield_is_that_of_linear_mechanics(rng):
 
 
 def test_at_rest_force_and_spring_are_in_balance(rng):
-    law = m.PrandtlIshlinskii(0.1, rng.uniform(0.05, 0.2, 3), rng.uniform(0, 10, 3), 0.0)
+    law = PrandtlIshlinskii(0.1, rng.uniform(0.05, 0.2, 3), rng.uniform(0, 10, 3), 0.0)
     stage = m.Stage.of(piezo=m.Piezo(0.5), mechanics=m.HystereticMechanics(m.Mechanics(80.0, 0.2), law))
     rest_V = rng.uniform(20, 60)
     still = np.asarray(compiled(stage)(jnp.asarray(T), jnp.full(50, rest_V)))
@@ -111,7 +112,7 @@ def test_derivatives_are_those_of_finite_differences(rng):
     voltage_V = jnp.asarray(60 * np.sin(2 * np.pi * 35 * np.arange(60) * T))
 
     def end_um(values):
-        law = m.BoucWen(0.0, values[0], values[1], values[2], 1.5, 0.0, 1)
+        law = BoucWen(0.0, values[0], values[1], values[2], 1.5, 0.0, 1)
         mechanics = m.HystereticMechanics(m.Mechanics(values[3], values[4]), law)
         return m.Stage.of(piezo=m.Piezo(0.2), mechanics=mechanics)(jnp.asarray(T), voltage_V)[-1]
 
@@ -153,7 +154,7 @@ def test_the_official_multisine_is_met_by_bench_and_model():
 
     mechanics = m.Mechanics.from_mass(oscillator.mass_kg, oscillator.stiffness_N_per_m, oscillator.damping_N_s_per_m)
     # The law's state is the hysteretic force over the stiffness, in um.
-    law = m.BoucWen(0.0, 1.0, 1e-6 * oscillator.beta * oscillator.gamma, 1e-6 * oscillator.beta * oscillator.delta)
+    law = BoucWen(0.0, 1.0, 1e-6 * oscillator.beta * oscillator.gamma, 1e-6 * oscillator.beta * oscillator.delta)
     stage = m.Stage.of(
         force=m.Piezo(1e6 / oscillator.stiffness_N_per_m),
         mechanics=m.HystereticMechanics(mechanics, law),

@@ -23,10 +23,10 @@ class Relays:
 
     def model(self):
         alpha_V = np.linspace(0, RANGE_V, LEVELS)[np.tril_indices(LEVELS)[0]]
-        areas_V2 = m.node_areas(LEVELS)[np.tril_indices(LEVELS)] * RANGE_V**2
+        areas_V2 = m.densities.node_areas(LEVELS)[np.tril_indices(LEVELS)] * RANGE_V**2
         weights_um = (self.flat_um_per_V2 + self.slant_um_per_V3 * alpha_V) * areas_V2
         reversible = m.Reversible(np.full(LEVELS, self.slope_um_per_V), 0.0, RANGE_V)
-        return m.Preisach(m.GridDensity(weights_um, 0.0, RANGE_V), reversible, self.offset_um)
+        return m.Preisach(m.densities.GridDensity(weights_um, 0.0, RANGE_V), reversible, self.offset_um)
 
     def area_um(self, high_V, low_V):
         d = high_V - low_V
@@ -200,6 +200,6 @@ def test_parts_without_an_inverse_and_too_few_samples_are_refused(rng):
     stage, _ = random_stage(rng)
     with pytest.raises(ValueError, match="4 samples"):
         m.invert_stage(stage, np.arange(3.0), np.zeros(3))
-    plays = m.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)
+    plays = m.hysteresis.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)
     with pytest.raises(ValueError, match="'hysteresis' is a PrandtlIshlinskii"):
         m.invert_stage(stage.swap("hysteresis", plays), np.arange(8.0), np.zeros(8))

@@ -63,9 +63,9 @@ def test_a_kept_program_answers_for_other_numbers(folder, again, rng):
 
 def test_stages_with_effects_answer_as_without(folder, again, rng):
     stage, uncertainty = draw(rng, substeps=2)
-    effects = {effect.name: effect for effect in reversed(m.EFFECTS)}
+    effects = {effect.name: effect for effect in reversed(m.effects.EFFECTS)}
     for effect in (effects["creep"](0.01, 0.1), effects["thermal_gain"](0.002, 21.0, 0.3)):
-        stage = m.extend(stage, effect)
+        stage = m.effects.extend(stage, effect)
     more = jnp.asarray(rng.normal(scale=1e-2, size=(40, 7)))
     uncertainty = replace(uncertainty, coordinates=jnp.concatenate([uncertainty.coordinates, more], axis=1))
     record = replace(program(rng, stage, True), extra={"temperature_degC": rng.normal(21, 1, 300)})

@@ -10,6 +10,7 @@ import pytest
 from _models import compiled
 
 import microid as m
+from microid import kinetostatics as ks
 
 # The argument lists of Eq. 5, as the paper orders them.
 ARGUMENTS = {
@@ -31,27 +32,34 @@ TWO_PORTS = {
     ("top", 0): (0.16429090017461, 0.03053040948153, 5.897244465194e-3),
     ("top", 1): (0.06487489533711, 0.01192161810697, 2.358364784348e-3),
 }
-FUNCTIONS = {"x": m.f_x, "y": m.f_y, "z": m.f_z, "alpha": m.f_alpha, "beta": m.f_beta, "gamma": m.f_gamma}
+FUNCTIONS = {
+    "x": ks.f_x,
+    "y": ks.f_y,
+    "z": ks.f_z,
+    "alpha": ks.f_alpha,
+    "beta": ks.f_beta,
+    "gamma": ks.f_gamma,
+}
 
 
 @compiled
 def moved(axis, geometry, piezo_um, constants, form="linear"):
-    return m.output(axis, geometry, piezo_um, constants, form)
+    return ks.output(axis, geometry, piezo_um, constants, form)
 
 
 @compiled
 def sensitivity(axis, geometry, piezo_um, constants, form="linear"):
-    return m.sensitivity(axis, geometry, piezo_um, constants, form)
+    return ks.sensitivity(axis, geometry, piezo_um, constants, form)
 
 
 def changed(geometry, name, by):
-    return eqx.tree_at(lambda g: getattr(g, m.DIMENSIONS[name].field), geometry, geometry[name] + by)
+    return eqx.tree_at(lambda g: getattr(g, ks.DIMENSIONS[name].field), geometry, geometry[name] + by)
 
 
 def randomised(rng):
     """A stage of other dimensions, each within 10 % of the paper's."""
-    geometry = m.Geometry()
-    for name in m.DIMENSIONS:
+    geometry = ks.Geometry()
+    for name in ks.DIMENSIONS:
         geometry = changed(geometry, name, float(geometry[name]) * rng.uniform(-0.1, 0.1))
     return geometry
 
@@ -65,25 +73,25 @@ def slope(function, step):
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("axis", ["x", "z", "alpha", "gamma"])
 def test_outputs_are_those_derived_elsewhere(axis, level):
-    geometry = m.Geometry()
-    found = moved(axis, geometry, 1.0, m.constants_of(geometry, level))
+    geometry = ks.Geometry()
+    found = moved(axis, geometry, 1.0, ks.constants_of(geometry, level))
     # As many digits as the reference was written down with.
     assert found == pytest.approx(REFERENCE[level][axis], rel=1e-12 if axis == "x" else 2e-12)
     other = {"x": "y", "alpha": "beta"}.get(axis)
     if other:
-        assert moved(other, geometry, 1.0, m.constants_of(geometry, level)) == found
+        assert moved(other, geometry, 1.0, ks.constants_of(geometry, level)) == found
 
 
 @pytest.mark.parametrize(("platform", "level"), TWO_PORTS)
 def test_two_ports_are_those_derived_elsewhere(platform, level):
-    g = m.Geometry()
-    constants = m.constants_of(g, level)
+    g = ks.Geometry()
+    constants = ks.constants_of(g, level)
     sizes = (
         (g.l1_mm, g.t1_mm, g.la1_mm, g.alpha1_rad)
         if platform == "bottom"
         else (g.l6_mm, g.t6_mm, g.la3_mm, g.alpha3_rad)
     )
-    found = m.bridge(*sizes, constants)
+    found = ks.bridge(*sizes, constants)
     scale = float(constants.youngs_modulus_MPa * constants.width_mm) / 1000
     per_modulus = np.array([found.K11_N_per_um, found.K12_N_per_um, found.K22_N_per_um]) / scale
     np.testing.assert_allclose(per_modulus, TWO_PORTS[platform, level], rtol=1e-11)
@@ -91,26 +99,26 @@ def test_two_ports_are_those_derived_elsewhere(platform, level):
     assert np.all(np.linalg.eigvalsh(stiffness) > 0)
 
 
-@pytest.mark.parametrize("axis", m.AXES)
+@pytest.mark.parametrize("axis", ks.AXES)
 def test_arguments_are_those_of_the_paper(axis):
     names = [name for name in inspect.signature(FUNCTIONS[axis]).parameters if name != "constants"]
-    unit = m.MOTIONS[axis].unit
+    unit = ks.MOTIONS[axis].unit
     assert names[0] == f"{axis}_out_{unit}"
     assert names[-1] == f"{axis}_pzt_um"
     symbols = [name.rpartition("_")[0] for name in names[1:-1]]
-    assert symbols == ARGUMENTS[axis].split() == list(m.MOTIONS[axis].dimensions)
+    assert symbols == ARGUMENTS[axis].split() == list(ks.MOTIONS[axis].dimensions)
     for name, symbol in zip(names[1:-1], symbols, strict=True):
-        assert name == m.DIMENSIONS[symbol].field
-    for function in m.MOTIONS[axis].functions.values():
+        assert name == ks.DIMENSIONS[symbol].field
+    for function in ks.MOTIONS[axis].functions.values():
         same = list(inspect.signature(function).parameters)
         assert [name.rpartition("_")[0] for name in same[1:-2]] == symbols
 
 
-@pytest.mark.parametrize("axis", m.AXES)
+@pytest.mark.parametrize("axis", ks.AXES)
 def test_output_enters_with_slope_one(axis, rng):
     geometry = randomised(rng)
-    constants = m.constants_of(geometry)
-    values = [geometry[name] for name in m.MOTIONS[axis].dimensions]
+    constants = ks.constants_of(geometry)
+    values = [geometry[name] for name in ks.MOTIONS[axis].dimensions]
     at, piezo_um = rng.uniform(-1, 1), rng.uniform(-20, 20)
     assert jax.grad(FUNCTIONS[axis])(at, *values, piezo_um, constants=constants) == 1.0
     out = moved(axis, geometry, piezo_um, constants)
@@ -121,7 +129,7 @@ def test_output_enters_with_slope_one(axis, rng):
 @pytest.mark.parametrize("axis", ["x", "z", "alpha", "gamma"])
 def test_derivatives_are_those_of_finite_differences(axis, level, rng):
     geometry, piezo_um = randomised(rng), rng.uniform(5, 20)
-    constants = m.constants_of(geometry, level)
+    constants = ks.constants_of(geometry, level)
     found = sensitivity(axis, geometry, piezo_um, constants)
     assert found.output == pytest.approx(float(moved(axis, geometry, piezo_um, constants)), rel=1e-14)
     by_piezo = slope(lambda h: float(moved(axis, geometry, piezo_um + h, constants)), 0.1)
@@ -145,13 +153,13 @@ FIRST = (("z", "pseudo_rigid"),)
     [
         pytest.param(axis, form, marks=() if (axis, form) in FIRST else pytest.mark.study)
         for axis in ("x", "z", "alpha", "gamma")
-        for form in m.MOTIONS[axis].functions
+        for form in ks.MOTIONS[axis].functions
         if form != "linear"
     ],
 )
 def test_derivatives_of_implicit_forms_too(axis, form, rng):
     geometry, piezo_um = randomised(rng), rng.uniform(10, 30)
-    constants = m.constants_of(geometry, 0)
+    constants = ks.constants_of(geometry, 0)
     found = sensitivity(axis, geometry, piezo_um, constants, form)
     by_piezo = slope(lambda h: float(moved(axis, geometry, piezo_um + h, constants, form)), 0.1)
     assert found.piezo == pytest.approx(by_piezo, rel=1e-9)
@@ -167,13 +175,13 @@ def test_derivatives_of_implicit_forms_too(axis, form, rng):
 @pytest.mark.parametrize("axis", ["x", "z", "alpha", "gamma"])
 def test_fixed_voltage_adds_what_stiffness_does(axis, rng):
     geometry, free_um, piezo_N_per_um = randomised(rng), 40.0, rng.uniform(25, 120)
-    found = compiled(m.voltage_sensitivity)(axis, geometry, free_um, m.constants_of(geometry), piezo_N_per_um)
+    found = compiled(ks.voltage_sensitivity)(axis, geometry, free_um, ks.constants_of(geometry), piezo_N_per_um)
 
     @compiled
     def loaded(geometry):
-        constants = m.constants_of(geometry)
-        stiffness = m.input_stiffness_N_per_um(axis, geometry, constants)
-        return m.output(axis, geometry, free_um * piezo_N_per_um / (piezo_N_per_um + stiffness), constants)
+        constants = ks.constants_of(geometry)
+        stiffness = ks.input_stiffness_N_per_um(axis, geometry, constants)
+        return ks.output(axis, geometry, free_um * piezo_N_per_um / (piezo_N_per_um + stiffness), constants)
 
     assert found.output == pytest.approx(float(loaded(geometry)), rel=1e-14)
     for name, value in found.dimensions.items():
@@ -185,7 +193,7 @@ def test_fixed_voltage_adds_what_stiffness_does(axis, rng):
 @pytest.mark.parametrize("axis", ["x", "z", "alpha", "gamma"])
 def test_modulus_and_width_cancel_from_motion_and_scale_stiffness(axis, rng):
     geometry = randomised(rng)
-    constants = m.constants_of(geometry)
+    constants = ks.constants_of(geometry)
     softer = eqx.tree_at(
         lambda c: (c.youngs_modulus_MPa, c.width_mm), constants, (jnp.asarray(70e3), jnp.asarray(23.0))
     )
@@ -193,8 +201,8 @@ def test_modulus_and_width_cancel_from_motion_and_scale_stiffness(axis, rng):
         float(moved(axis, geometry, 7.0, constants)), rel=1e-14
     )
     ratio = 70e3 * 23.0 / float(constants.youngs_modulus_MPa * constants.width_mm)
-    stiffness = m.input_stiffness_N_per_um(axis, geometry, constants)
-    assert m.input_stiffness_N_per_um(axis, geometry, softer) == pytest.approx(ratio * float(stiffness), rel=1e-13)
+    stiffness = ks.input_stiffness_N_per_um(axis, geometry, constants)
+    assert ks.input_stiffness_N_per_um(axis, geometry, softer) == pytest.approx(ratio * float(stiffness), rel=1e-13)
 
 
 @pytest.mark.parametrize("level", [0, 1])
@@ -202,27 +210,27 @@ def test_thin_hinges_turn_freely_and_weak_guides_do_not_load(level, rng):
     geometry = randomised(rng)
     thin = eqx.tree_at(lambda g: (g.t1_mm, g.t4_mm), geometry, (jnp.asarray(1e-6), jnp.asarray(1e-6)))
     cotangent = 1 / np.tan(float(geometry.alpha2_rad))
-    assert m.gain("z", thin, m.constants_of(thin, level)) == pytest.approx(cotangent, rel=1e-6)
-    constants = m.constants_of(geometry, level)
-    drive = m.bridge(geometry.l1_mm, geometry.t1_mm, geometry.la1_mm, geometry.alpha1_rad, constants)
+    assert ks.gain("z", thin, ks.constants_of(thin, level)) == pytest.approx(cotangent, rel=1e-6)
+    constants = ks.constants_of(geometry, level)
+    drive = ks.bridge(geometry.l1_mm, geometry.t1_mm, geometry.la1_mm, geometry.alpha1_rad, constants)
     unguided = eqx.tree_at(lambda c: c.guides, constants, jnp.asarray(0.0))
-    assert m.gain("x", geometry, unguided) == pytest.approx(float(drive.ratio), rel=1e-14)
-    assert m.gain("x", geometry, constants) < drive.ratio
+    assert ks.gain("x", geometry, unguided) == pytest.approx(float(drive.ratio), rel=1e-14)
+    assert ks.gain("x", geometry, constants) < drive.ratio
 
 
 def test_a_level_or_form_that_does_not_exist_is_refused():
-    geometry = m.Geometry()
+    geometry = ks.Geometry()
     with pytest.raises(ValueError, match="levels 0 and 1, got 2"):
-        m.constants_of(geometry, 2)
+        ks.constants_of(geometry, 2)
     with pytest.raises(ValueError, match="x has no form 'pseudo_rigid': choose one of linear, beam"):
-        m.output("x", geometry, 1.0, m.constants_of(geometry, 0), "pseudo_rigid")
+        ks.output("x", geometry, 1.0, ks.constants_of(geometry, 0), "pseudo_rigid")
     with pytest.raises(ValueError, match="form 'beam' is of level 0"):
-        m.output("x", geometry, 1.0, m.constants_of(geometry, 1), "beam")
+        ks.output("x", geometry, 1.0, ks.constants_of(geometry, 1), "beam")
 
 
 def test_constants_of_the_stage_are_those_derived_elsewhere():
-    geometry = m.Geometry()
-    constants = m.constants_of(geometry)
+    geometry = ks.Geometry()
+    constants = ks.constants_of(geometry)
     table = {
         "x": (6.532, 45.8, 20.9, 136, 77, 7018e-3, 579),
         "z": (9.148, 33.8, 23.9, 218, 164, 3700e-3, 143),
@@ -230,7 +238,7 @@ def test_constants_of_the_stage_are_those_derived_elsewhere():
         "gamma": (0.50085e-3, 35.0, 23.5, 11.8e-3, 319, 6.980e4, 1390),
     }
     for axis, row in table.items():
-        found = compiled(m.stage_constants)(axis, geometry, constants, m.Actuation())
+        found = compiled(ks.stage_constants)(axis, geometry, constants, ks.Actuation())
         shown = (
             found.gain,
             found.input_stiffness_N_per_um,
@@ -249,12 +257,12 @@ def test_constants_of_the_stage_are_those_derived_elsewhere():
 
 
 def test_driving_error_is_what_a_proportional_piezo_leaves(rng):
-    density = m.GridDensity(jnp.asarray(rng.uniform(0.1, 0.3, 36)), jnp.asarray(0.0), jnp.asarray(120.0))
+    density = m.densities.GridDensity(jnp.asarray(rng.uniform(0.1, 0.3, 36)), jnp.asarray(0.0), jnp.asarray(120.0))
     model = m.Preisach(
         density, m.Reversible(jnp.full(8, 0.2), jnp.asarray(0.0), jnp.asarray(120.0)), jnp.asarray(3.0)
     )
     voltage = jnp.concatenate([jnp.linspace(0, 120, 100), jnp.linspace(119, 0, 100)])
-    found = compiled(m.driving_error)(model, voltage)
+    found = compiled(ks.driving_error)(model, voltage)
     elongation = np.asarray(compiled(model)(voltage))
     elongation = elongation - elongation[0]
     fitted = np.linalg.lstsq(np.asarray(voltage)[:, None], elongation, rcond=None)[0]
@@ -262,10 +270,10 @@ def test_driving_error_is_what_a_proportional_piezo_leaves(rng):
     np.testing.assert_allclose(found.signed_um, elongation - fitted[0] * np.asarray(voltage), atol=1e-12)
     np.testing.assert_allclose(found.absolute_um, np.abs(found.signed_um))
     assert found.signed_um.min() < 0 < found.signed_um.max()
-    given = compiled(m.driving_error)(model, voltage, 0.3)
+    given = compiled(ks.driving_error)(model, voltage, 0.3)
     np.testing.assert_allclose(given.signed_um, elongation - 0.3 * np.asarray(voltage), atol=1e-12)
 
 
 def test_parts_of_the_error_add_up():
-    found = m.total_error(3.0, -4.0, 12.0)
+    found = ks.total_error(3.0, -4.0, 12.0)
     assert (found.signed, found.worst_case, found.root_sum_square) == (11.0, 19.0, 13.0)

@@ -6,19 +6,19 @@ from _models import compiled
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-import microid as m
+from microid import kinetostatics as ks
 
 
 @compiled
 def moved(axis, geometry, piezo_um, constants, form):
-    return m.output(axis, geometry, piezo_um, constants, form)
+    return ks.output(axis, geometry, piezo_um, constants, form)
 
 
 def varied(rng):
     """Other bridges for x and z."""
-    scale = {name: rng.uniform(0.9, 1.1) for name in m.DIMENSIONS}
-    geometry = m.Geometry()
-    return m.Geometry(**{d.field: float(geometry[name]) * scale[name] for name, d in m.DIMENSIONS.items()})
+    scale = {name: rng.uniform(0.9, 1.1) for name in ks.DIMENSIONS}
+    geometry = ks.Geometry()
+    return ks.Geometry(**{d.field: float(geometry[name]) * scale[name] for name, d in ks.DIMENSIONS.items()})
 
 
 def integrated_um(length, thickness, leg, inclination, spring, piezo_um):
@@ -63,8 +63,8 @@ def integrated_um(length, thickness, leg, inclination, spring, piezo_um):
 @pytest.mark.parametrize("piezo_um", [40.0, 11.0, -15.0])
 def test_leaves_bend_as_the_integrated_equation_says(piezo_um, rng):
     g = varied(rng)
-    constants = m.constants_of(g, 0)
-    load = m.guide_stiffness_N_per_um(g.l2_mm, g.t2_mm, g.l3_mm, constants)
+    constants = ks.constants_of(g, 0)
+    load = ks.guide_stiffness_N_per_um(g.l2_mm, g.t2_mm, g.l3_mm, constants)
     spring = float(load * 1000 / (constants.youngs_modulus_MPa * constants.width_mm))
     bottom = [float(x) for x in (g.l1_mm, g.t1_mm, g.la1_mm, g.alpha1_rad)]
     middle = [float(x) for x in (g.l4_mm, g.t4_mm, g.la2_mm, g.alpha2_rad)]
@@ -87,9 +87,9 @@ def test_links_turn_as_statics_says(piezo_um, rng):
 
     turn = brentq(lambda a: elongation(a) - piezo_um / 1000, -inclination, 0.95 * inclination, xtol=1e-16)
     lift_um = 2000 * leg * (np.sin(inclination) - np.sin(inclination - turn))
-    constants = m.constants_of(g, 0)
+    constants = ks.constants_of(g, 0)
     assert moved("z", g, piezo_um, constants, "pseudo_rigid") == pytest.approx(lift_um, rel=1e-10)
-    tilt = np.arctan(lift_um / 1000 / float(m.tilt_arm_mm(g.l_mm, g.l5_mm)))
+    tilt = np.arctan(lift_um / 1000 / float(ks.tilt_arm_mm(g.l_mm, g.l5_mm)))
     assert moved("alpha", g, piezo_um, constants, "pseudo_rigid") == pytest.approx(tilt, rel=1e-10)
 
 
@@ -98,18 +98,18 @@ def test_links_turn_as_statics_says(piezo_um, rng):
 )
 def test_small_strokes_are_those_of_the_linear_form(axis, rng):
     g = varied(rng)
-    constants = m.constants_of(g, 0)
-    for form in m.MOTIONS[axis].functions:
+    constants = ks.constants_of(g, 0)
+    for form in ks.MOTIONS[axis].functions:
         assert abs(moved(axis, g, 0.0, constants, form)) < 1e-9
-        slope = compiled(m.sensitivity)(axis, g, 0.0, constants, form).piezo
-        assert slope == pytest.approx(float(m.gain(axis, g, constants)), rel=1e-9)
+        slope = compiled(ks.sensitivity)(axis, g, 0.0, constants, form).piezo
+        assert slope == pytest.approx(float(ks.gain(axis, g, constants)), rel=1e-9)
 
 
 @pytest.mark.study
 def test_what_the_large_stroke_costs_is_what_finite_elements_say():
     """Error of the linear form against co-rotational finite elements, read off a table to two digits."""
-    g = m.Geometry()
-    constants = m.constants_of(g, 0)
+    g = ks.Geometry()
+    constants = ks.constants_of(g, 0)
     table = {"x": (0.33, 1.7, 3.7, 8.2), "z": (0.44, 2.4, 5.2, 12.3), "gamma": (-0.03, -0.17, -0.35, -0.7)}
     for axis, row in table.items():
         for piezo_um, percent in zip((2.0, 10.0, 20.0, 40.0), row, strict=True):
@@ -118,6 +118,6 @@ def test_what_the_large_stroke_costs_is_what_finite_elements_say():
 
 
 def test_a_stroke_beyond_the_leaves_is_refused():
-    g = m.Geometry()
+    g = ks.Geometry()
     with pytest.raises(Exception, match=r"shorten it|maximum number of steps"):
-        moved("z", g, 2000.0, m.constants_of(g, 0), "beam").block_until_ready()
+        moved("z", g, 2000.0, ks.constants_of(g, 0), "beam").block_until_ready()

@@ -35,24 +35,24 @@ def random_laws(rng):
     stiffness = rng.uniform(0.02, 0.05, k)
     return {
         "prandtl": (
-            m.PrandtlIshlinskii(
+            m.hysteresis.PrandtlIshlinskii(
                 rng.uniform(0.1, 0.3), rng.uniform(0.02, 0.1, k), rng.uniform(0, 30, k), rng.normal()
             ),
             rng.uniform(-20, 20, k),
         ),
         "maxwell": (
-            m.MaxwellSlip(0.4, stiffness, stiffness * rng.uniform(0, 30, k), rng.normal()),
+            m.hysteresis.MaxwellSlip(0.4, stiffness, stiffness * rng.uniform(0, 30, k), rng.normal()),
             rng.normal(0, 9, k),
         ),
-        "dahl": (m.Dahl(0.4, rng.uniform(1, 3), rng.uniform(8, 20), rng.normal()), rng.uniform(-1, 1, 2)),
+        "dahl": (m.hysteresis.Dahl(0.4, rng.uniform(1, 3), rng.uniform(8, 20), rng.normal()), rng.uniform(-1, 1, 2)),
         "duhem": (
-            m.Duhem(
+            m.hysteresis.Duhem(
                 rng.uniform(0.02, 0.1), rng.uniform(0.2, 0.4), rng.normal(0, 1e-3), rng.uniform(0, 0.2), rng.normal()
             ),
             rng.normal(size=2),
         ),
         "bouc-wen": (
-            m.BoucWen(
+            m.hysteresis.BoucWen(
                 0.4, rng.uniform(0.1, 0.3), 0.03, rng.uniform(-0.01, 0.01), rng.uniform(2, 3), rng.normal(), 64
             ),
             rng.uniform(-1, 1, 2),
@@ -228,6 +228,6 @@ def test_what_runs_on_an_accelerator_gives_the_same(name, rng, monkeypatch):
 
 def test_parts_of_unequal_lengths_are_refused():
     with pytest.raises(ValueError, match="every play has a weight and a threshold"):
-        m.PrandtlIshlinskii(1.0, np.ones(2), np.ones(3))
+        m.hysteresis.PrandtlIshlinskii(1.0, np.ones(2), np.ones(3))
     with pytest.raises(ValueError, match="every element has a stiffness and a limit"):
-        m.MaxwellSlip(1.0, np.ones(2), np.ones(3))
+        m.hysteresis.MaxwellSlip(1.0, np.ones(2), np.ones(3))

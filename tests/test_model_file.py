@@ -23,7 +23,7 @@ REPORT = {"status": "converged", "noise_um": 0.1 + 0.2, "remarks": ["a: b"], "he
 def draw(family, rng, levels=7):
     lower, upper = jnp.asarray(rng.uniform(-5, 0)), jnp.asarray(rng.uniform(10, 100))
     key = jax.random.key(int(rng.integers(2**31)))
-    density = microid.FAMILIES[family].start(lower, upper, levels, jnp.asarray(rng.uniform(5, 50)), key)
+    density = microid.densities.FAMILIES[family].start(lower, upper, levels, jnp.asarray(rng.uniform(5, 50)), key)
     slope = jnp.asarray(rng.uniform(0, 1, levels) / 3)
     model = microid.Preisach(density, microid.Reversible(slope, lower, upper), jnp.asarray(rng.normal()))
     grid = Grid(lower, upper, levels)
@@ -59,7 +59,7 @@ def refusal(path):
     return message
 
 
-@pytest.mark.parametrize("family", sorted(microid.FAMILIES))
+@pytest.mark.parametrize("family", sorted(microid.densities.FAMILIES))
 def test_every_family_comes_back_bit_by_bit(tmp_path, rng, family):
     model, uncertainty = draw(family, rng)
     save_model(tmp_path / "a.json", model, uncertainty, REPORT)

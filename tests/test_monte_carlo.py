@@ -8,12 +8,12 @@ from _gain_formulas import ARGUMENTS, TABLE_1, TWINS, curvatures, gains, sizes, 
 from scipy import stats
 from scipy.optimize import brentq
 
-import microid as m
 from fits.io._errors import DataError
 from fits.machining._design import Together, paper_design
 from fits.machining._gains import gain_model, gains_of_many
 from fits.machining._monte_carlo import monte_carlo, second_order
 from fits.machining._tolerances import copula_root, from_normal
+from microid import kinetostatics as ks
 
 LAWS = {
     "normal": lambda half: stats.norm(0, half / 3),
@@ -52,7 +52,7 @@ def balanced_guides(t1=0.8):
 @pytest.mark.parametrize(("level", "voltage"), [(1, False), (0, True)])
 def test_gains_are_those_of_the_formulas(rng, level, voltage):
     stage = design(level=level, guides=rng.uniform(3, 8))
-    names = tuple(m.DIMENSIONS) if voltage else tuple({name: 0 for own in ARGUMENTS.values() for name in own})
+    names = tuple(ks.DIMENSIONS) if voltage else tuple({name: 0 for own in ARGUMENTS.values() for name in own})
     noise = rng.uniform(-1, 1, (len(names), 500))
     centre = np.array([TABLE_1[name] for name in names])
     values = dict(zip(names, centre[:, None] * (1 + 0.05 * noise), strict=True))
@@ -201,8 +201,8 @@ def test_new_designs_are_not_compiled_again(monkeypatch, seed):
     def fail(*_):
         raise AssertionError("traced again")
 
-    monkeypatch.setattr(m, "gain", fail)
-    other = replace(paper_design(0.03), geometry=m.Geometry(t4_mm=0.9, alpha2_rad=0.07), guides=6)
+    monkeypatch.setattr(ks, "gain", fail)
+    other = replace(paper_design(0.03), geometry=ks.Geometry(t4_mm=0.9, alpha2_rad=0.07), guides=6)
     told = []
     study = monte_carlo(other, 150_000, "normal", seed=seed, axes=("z",), progress=told.append)
     assert study.axes["z"].nominal == pytest.approx(gains("z", sizes(t4=0.9, alpha2=0.07)), rel=1e-12)

@@ -22,7 +22,7 @@ from fits.diagnosis._score import law_of, probes_of, scales_of, score
 from fits.diagnosis._select import Cause, select
 from fits.loop._run import prepare_run
 from fits.stats._noise import Noise
-from microid import EFFECTS
+from microid.effects import EFFECTS
 
 MOST = 3000
 

@@ -25,7 +25,7 @@ LOWER_V, UPPER_V, LEVELS = 0.0, 100.0, 9
 @pytest.fixture(scope="module")
 def model():
     lower, upper = jnp.asarray(LOWER_V), jnp.asarray(UPPER_V)
-    density = microid.GridDensity.start(lower, upper, LEVELS, jnp.asarray(15.0), jax.random.key(0))
+    density = microid.densities.GridDensity.start(lower, upper, LEVELS, jnp.asarray(15.0), jax.random.key(0))
     return microid.Preisach(density, microid.Reversible(jnp.full(LEVELS, 0.2), lower, upper), jnp.asarray(3.0))
 
 

@@ -120,7 +120,7 @@ SAVE = """
 import jax; jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, microid, fits
 from microid.hysteresis import LAWS
-[effect] = [each for each in microid.EFFECTS if each.name == "wrong_gain"]
+[effect] = [each for each in microid.effects.EFFECTS if each.name == "wrong_gain"]
 law = LAWS["spring"](jnp.asarray(0.25), jnp.asarray(1.0))
 stage = microid.Stage.of(hysteresis=law, sensor=effect(jnp.asarray(0.5)))
 fits.save_model("spring.json", stage, None, {})

@@ -180,7 +180,7 @@ def test_new_data_of_the_same_shape_compile_nothing(rng):
     for make in (float, np.asarray, jnp.asarray):
         model = random_model(rng)
         lower_V, upper_V = (make(v) for v in limits_V(model))
-        density = m.GridDensity(make_list(model.density.packed_um), lower_V, upper_V)
+        density = m.densities.GridDensity(make_list(model.density.packed_um), lower_V, upper_V)
         model = m.Preisach(
             density, m.Reversible(np.asarray(model.reversible.slope_um_per_V), lower_V, upper_V), make(3.0)
         )
@@ -196,7 +196,7 @@ def make_list(packed_um):
 
 
 def test_parts_with_differing_levels_are_refused():
-    density = m.GridDensity(np.ones(6), 0.0, 1.0)
+    density = m.densities.GridDensity(np.ones(6), 0.0, 1.0)
     with pytest.raises(ValueError, match="3 levels and the reversible part 4"):
         m.Preisach(density, m.Reversible(np.ones(4), 0.0, 1.0), 0.0)
     with pytest.raises(ValueError, match="two levels or more"):

@@ -7,12 +7,20 @@ import importlib.metadata
 import inspect
 import pkgutil
 import re
+import runpy
 import typing
 
+import numpy as np
 import pytest
 from test_architecture import PACKAGES, ROOT, relative
 
 import microid
+
+# Modules in which names are public, each name in one of them.
+MODULES = [
+    *PACKAGES,
+    *(f"microid.{name}" for name in ("control", "densities", "effects", "hysteresis", "kinetostatics")),
+]
 
 
 def listed(package):
@@ -24,10 +32,8 @@ def listed(package):
             for alias in node.names:
                 if (alias.asname or "").startswith("_"):
                     continue
-                grouped = package in ("fits", "microid") and alias.asname is None
-                assert grouped or alias.asname == alias.name, (
-                    f"{package} lists {alias.name} without `as {alias.name}`"
-                )
+                if f"{node.module}.{alias.name}" in MODULES:
+                    continue
                 assert alias.name not in names, f"{package} lists {alias.name} twice"
                 names[alias.name] = node.module
     return names
@@ -38,9 +44,7 @@ def is_defined(value):
     return callable(value) and typing.get_origin(value) is None
 
 
-@pytest.mark.parametrize(
-    "package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"]
-)
+@pytest.mark.parametrize("package", MODULES)
 def test_public_names_are_the_listed_ones(package):
     module, names = importlib.import_module(package), listed(package)
     assert names
@@ -69,14 +73,23 @@ def test_names_that_fits_looks_up_late_are_the_ones_it_declares():
         fits.nothing
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("package", MODULES)
 def test_public_names_are_in_all(package):
     assert sorted(importlib.import_module(package).__all__) == sorted(listed(package))
 
 
+def test_a_model_is_public_in_one_place():
+    homes = [name for name in MODULES if name.startswith("microid")]
+    every = [name for home in homes for name in listed(home)]
+    # What registers a plug-in is in the folder of its kind.
+    assert {name for name in every if every.count(name) > 1} == {"register"}
+    assert len(listed("microid")) < 60
+    # Found without being imported by itself.
+    assert all(microid.__dict__[home.partition(".")[2]].__name__ == home for home in homes[1:])
+
+
 def test_everything_that_microid_defines_without_an_underscore_is_public():
-    names = set(listed("microid")) | set(listed("microid.densities")) | set(listed("microid.hysteresis"))
-    names |= set(listed("microid.effects"))
+    names = {name for home in MODULES if home.startswith("microid") for name in listed(home)}
     for path in (ROOT / "microid").rglob("*.py"):
         defined = ast.parse(path.read_text(encoding="utf-8")).body
         found = {node.name for node in defined if isinstance(node, ast.FunctionDef | ast.ClassDef)}
@@ -85,7 +98,7 @@ def test_everything_that_microid_defines_without_an_underscore_is_public():
         public = {name for name in found if name[0] != "_"}
         if path.parent.name == "effects" and path.stem[0] != "_":
             # An effect is public by being registered, so that a new one is one new file.
-            effects = {effect.__name__: effect.__module__ for effect in microid.EFFECTS}
+            effects = {effect.__name__: effect.__module__ for effect in microid.effects.EFFECTS}
             assert public == {name for name, home in effects.items() if home == f"microid.effects.{path.stem}"}
             continue
         assert public <= names, relative(path)
@@ -109,9 +122,7 @@ def documented(owner, value):
                 yield f"{owner}.{name}", bool(inspect.getdoc(member))
 
 
-@pytest.mark.parametrize(
-    "package", [*PACKAGES, "microid.control", "microid.densities", "microid.effects", "microid.hysteresis"]
-)
+@pytest.mark.parametrize("package", MODULES)
 def test_public_names_have_docstrings(package):
     module = importlib.import_module(package)
     values = {name: getattr(module, name) for name in listed(package)}
@@ -135,14 +146,43 @@ def numbers_of(value):
     return [name for name, kind in kinds.items() if name[0] != "_" and real.search(str(kind))]
 
 
-@pytest.mark.parametrize("package", ["microid", "fits"])
+def silent_numbers(value):
+    """Numbers whose name has no unit, and of which the docstring does not tell."""
+    words = (inspect.getdoc(value) or "").lower()
+    unnamed = (name for name in numbers_of(value) if not UNIT.search(name))
+    return [name for name in unnamed if not any(part[:4] in words for part in name.lower().split("_"))]
+
+
+@pytest.mark.parametrize("package", MODULES)
 def test_public_numbers_have_a_unit_in_their_name_or_their_docstring_tells_of_them(package):
-    module, silent, seen = importlib.import_module(package), [], 0
-    for name in module.__all__:
-        value = getattr(module, name)
-        for number in numbers_of(value) if is_defined(value) else ():
-            seen += 1
-            told = any(word[:4] in inspect.getdoc(value).lower() for word in number.lower().split("_"))
-            silent += [] if UNIT.search(number) or told else [f"{name}.{number}"]
-    assert seen > 100
-    assert silent == []
+    module = importlib.import_module(package)
+    values = {name: getattr(module, name) for name in module.__all__}
+    silent = {name: silent_numbers(value) for name, value in values.items() if is_defined(value)}
+    assert {name: numbers for name, numbers in silent.items() if numbers} == {}
+
+
+@pytest.mark.parametrize("package", [name for name in MODULES if name != "data_synth"])
+def test_the_site_has_every_public_name_in_a_group_and_words_of_each(package):
+    conf = runpy.run_path(str(ROOT / "docs" / "site" / "conf.py"))
+    module, source = importlib.import_module(package), ["# Names\n"]
+    groups = dict(conf["groups_of"](module))
+    assert sorted(name for names in groups.values() for name in names) == sorted(module.__all__)
+    assert all(names == sorted(names) for names in groups.values())
+    # Of a constant without words below it there is an error.
+    conf["grouped"](None, f"docs/site/names/{package}", source)
+    shown = re.findall(r"^\.\. (?:autoclass|autoexception|autofunction|data):: (\w+)$", source[0], re.MULTILINE)
+    assert sorted(shown) == sorted(module.__all__)
+    assert f"names/{package}\n" in (ROOT / "docs" / "site" / "index.md").read_text(encoding="utf-8")
+    with pytest.raises(AssertionError, match="from nowhere"):
+        conf["words_of"](module, "nothing")
+
+
+def test_a_number_without_a_unit_is_seen():
+    def push(force: float, voltage_V: float, travel: np.ndarray) -> float:
+        """Push by a force in N."""
+
+    assert numbers_of(push) == ["force", "voltage_V", "travel"]
+    assert silent_numbers(push) == ["travel"]
+    assert sum(len(numbers_of(getattr(microid.control, name))) for name in ("PID", "simulate_loop")) > 10
+    push.__doc__ = None
+    assert dict(documented("push", push)) == {"push": False}

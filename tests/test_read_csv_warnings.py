@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from _measured import measured
 
+from fits import read_table
 from fits.io._errors import DataError
 from fits.io._read_csv import read_table as read_csv
 from fits.io._units import parse_columns
@@ -116,3 +117,8 @@ def test_a_sensor_at_its_end_is_noticed(tmp_path):
         path.write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]) + "\n")
         warnings = read_csv(path).warnings
         assert [lines in warning for warning in warnings] == ([True] if lines else [])
+
+
+def test_a_column_in_a_unit_of_another_quantity_is_not_proposed():
+    with pytest.raises(DataError, match=r"'time_s': 't\[s\]', 'voltage_V': 'Vcmd\[V\]', 'disp"):
+        read_table({"t": np.arange(9.0), "Vcmd": np.arange(9.0), "gauge_um": np.arange(9.0)})

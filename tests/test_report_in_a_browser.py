@@ -6,8 +6,10 @@ import re
 import pytest
 from _browser import browser, opened, printed
 from _diagnosis import KINDS, diagnosis
+from PIL import Image
 
 from fits.report._diagnosis import report_html
+from fits.report._page import write_page
 
 pytestmark = pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the report with")
 # A sheet of A4 less its margins, in CSS pixels of 1/96 in.
@@ -91,3 +93,35 @@ def test_the_report_prints_on_a4_and_nothing_is_cut(rng, tmp_path, kind):
     assert sheets_needed <= sheets <= 1 + 1.3 * sheets_needed
     wide = page.replace("<main>", '<main><div style="width: 3000px">x</div>', 1).replace("@media print", "@media all")
     assert opened(wide, SHEET_px[0], tmp_path, LAID_OUT)["acted"]["beyond"]
+
+
+WORDS = """FAR FROM NOISE 1.745 um rms in fast.csv, 4.35 % of its stroke and 58.3 times the sensor's noise (29.9 nm)
+                samples      e_rms                   e_max
+in-sample         25682    3.309 %     1.328 um    14.88 %     5.972 um
+e_rms: root mean square error, e_max: largest error, both in % of the measured range (Eq. 35, 36)"""
+# Ends of what holds text beyond the edge of its box, and how wide each picture is.
+WORDS_LAID = """(() => ({
+    cut: [...d.querySelectorAll(".words span")].filter(one => one.scrollWidth > one.closest("pre").clientWidth)
+        .map(one => one.className),
+    lines: [...d.querySelectorAll(".words span")].map(one => one.getBoundingClientRect().height),
+    images: [...d.images].map(one => one.getBoundingClientRect().width)}))()"""
+
+
+@pytest.mark.parametrize("width_px", [390, 1200])
+def test_words_of_a_page_are_not_cut_and_pictures_have_their_size(tmp_path, width_px):
+    for name, wide_px in (("narrow", 708), ("wide", 1418)):
+        Image.new("RGB", (wide_px, 100)).save(tmp_path / f"{name}.png")
+    write_page(tmp_path, "Fit of train.csv", WORDS, [tmp_path / "narrow.png", tmp_path / "wide.png"])
+    page = (tmp_path / "index.html").read_text().replace("<head>", f'<head><base href="{tmp_path.as_uri()}/">')
+    seen = opened(page, width_px, tmp_path, WORDS_LAID)
+    assert (seen["problems"], seen["broken"]) == ([], 0)
+    assert seen["needed"] <= width_px
+    # A phone shows a table by moving it sideways, and no sentence so.
+    acted = seen["acted"]
+    assert "line" not in acted["cut"]
+    assert ("row" in acted["cut"]) == (width_px < 500)
+    sentence, head, row, _ = acted["lines"]
+    assert sentence > head == row
+    narrow_px, wide_px = acted["images"]
+    assert narrow_px == pytest.approx(708 * 96 / 200, abs=1)
+    assert wide_px == pytest.approx(480 if width_px < 500 else 1418 * 96 / 200, abs=1)

@@ -13,9 +13,9 @@ from fits.diagnosis._result import Gain
 from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
-from fits.report._next_steps import next_steps, runs_read, stage_parameters
+from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
 from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
-from microid import EFFECTS
+from microid.effects import EFFECTS
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
 
@@ -138,7 +138,7 @@ def test_what_is_to_be_recorded_does_not_contradict_itself(rng):
         found = replace(diagnosis(rng, kind), next_experiment=None)
         page, steps = text_of(found), " ".join(words for words, _ in next_steps(found))
         assert ("Record a run" in steps) == (kind == "unexplained")
-        assert ("what to record instead stands at the top" in page) == ("Record a run" in steps)
+        assert "What to measure next" not in page
         # Why not, a remark says where there is a reason: the page has none of its own beside it.
         assert "would not tell which known effect" not in page
         assert ("that beside what was found" in page) == bool(found.causes)
@@ -146,7 +146,44 @@ def test_what_is_to_be_recorded_does_not_contradict_itself(rng):
 
 def test_a_headline_has_every_effect_that_a_cause_may_be(rng):
     made = replace(diagnosis(rng), causes=(cause("creep", ("aging",)), cause("friction")))
-    assert headline(made) == "The stage shows creep or aging and friction."
+    assert headline(made) == "The stage shows creep (or aging) and friction."
+    assert headline(replace(made, causes=made.causes[:1])) == "The stage shows creep or aging."
+
+
+def test_several_causes_have_one_sentence_with_the_whole_that_each_is_a_part_of(rng):
+    made = replace(diagnosis(rng), causes=(cause("floor_vibration"), cause("creep"), cause("friction")))
+    first, *_ = verdict_sentence(made).split(". Beyond")
+    assert re.match(
+        r"Of the reproducible misfit .*93 % is explained by creep .* and 93 % by friction .*; of the", first
+    )
+    assert re.search(r"; of the noise 93 % is explained by floor vibration \([^()]*\)$", first)
+    assert first.count("standard deviations") == 2
+
+
+def test_no_line_ends_between_a_number_and_its_unit(rng):
+    page = report_html(diagnosis(rng, "unexplained"))
+    text = re.sub(r"<pre.*?</pre>|<svg.*?</svg>|<style.*?</style>|<[^>]+>", " ", page, flags=re.DOTALL)
+    quantity = r"\d(\s)(?:%|[pnµ]m|s|Hz|V|\N{GREEK SMALL LETTER SIGMA})(?![\w/])"
+    breaks = re.findall(quantity, text)
+    assert len(breaks) > 20
+    assert set(breaks) == {"\N{NO-BREAK SPACE}"}
+
+
+def test_numbers_of_an_experiment_stand_once_and_of_one_suspect_not_beside_its_evidence(rng):
+    made = diagnosis(rng, "unexplained")
+    page = text_of(made)
+    assert page.count(made.next_experiment.purpose) == 1
+    assert "Tells apart creep and aging" in page
+    one = replace(made, next_experiment=replace(made.next_experiment, separates=("creep",)))
+    assert "Would show creep" in text_of(one)
+    assert "Predicted separation" not in text_of(one)
+
+
+def test_what_is_found_in_the_noise_is_said_to_stay(rng):
+    for name in ("floor_vibration", "creep"):
+        assert ("no model takes it away" in text_of(replace(diagnosis(rng), causes=(cause(name),)))) == (
+            name != "creep"
+        )
 
 
 def test_lengths_are_in_the_unit_that_they_ask_for():
@@ -173,6 +210,9 @@ def test_commands_name_the_runs_and_those_held_out(rng):
     again = next_steps(found)[1][1]
     assert again == "microid diagnose slow.csv answer.csv --holdout 'a b.csv' --out again"
     assert [row[-1] for row in runs_read(runs)] == ["80 % fitted", "held out"]
+    assert "was looked at to choose" in partly_fitted(runs)
+    assert "was held out" in partly_fitted(runs[:1])
+    assert partly_fitted(runs[1:]) == ""
     assert runs_read(runs)[0][1:4] == ("3000", number(np.ptp(first.time_s)), number(np.ptp(first.voltage_V)))
     silent = replace(found, verdict="unexplained", next_experiment=None)
     assert next_steps(silent)[-1][0].startswith("Record a run at another speed")

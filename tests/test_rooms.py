@@ -58,7 +58,7 @@ def test_rooms_of_fits_import_only_those_below(path):
 
 def test_no_effect_is_known_by_its_name_in_fits():
     """What is known of an effect stands on its card, in its own file."""
-    names = {effect.name for effect in microid.EFFECTS}
+    names = {effect.name for effect in microid.effects.EFFECTS}
     # A name of one word may also be a word of a sentence.
     compound = {name for name in names if "_" in name}
     assert len(compound) > 10

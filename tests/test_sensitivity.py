@@ -11,9 +11,9 @@ import pytest
 from _models import compiled
 
 import fits
-import microid as m
 from fits.machining._claims import describe_claims
 from fits.report._machining import sensitivity_json
+from microid import kinetostatics as ks
 
 # Section 8.1 of the project's derivation of the closed forms, which came before the code: % of output at plus one
 # tolerance, ranked, then root sum of squares and worst case; and to how many digits.
@@ -52,19 +52,19 @@ def paper():
 
 @compiled
 def output(axis, geometry, piezo_um, constants):
-    return m.output(axis, geometry, piezo_um, constants)
+    return ks.output(axis, geometry, piezo_um, constants)
 
 
 @compiled
 def held_output(axis, geometry, constants, actuation):
     """Output at full voltage, the piezo being compressed by the stage it pushes."""
     at = constants.at(geometry)
-    piezo_um = m.loaded_um(axis, geometry, actuation.free_stroke_um, at, actuation.piezo_N_per_um)
-    return m.output(axis, geometry, piezo_um, at)
+    piezo_um = ks.loaded_um(axis, geometry, actuation.free_stroke_um, at, actuation.piezo_N_per_um)
+    return ks.output(axis, geometry, piezo_um, at)
 
 
 def changed(geometry, name, error):
-    field = m.DIMENSIONS[name].field
+    field = ks.DIMENSIONS[name].field
     return dataclasses.replace(geometry, **{field: getattr(geometry, field) + error})
 
 
@@ -77,10 +77,14 @@ def slope(function, step):
 
 def near(design, rng):
     """A design with other sizes, none off by more than a tenth."""
-    geometry = m.Geometry(
-        **{d.field: design.geometry[name] * rng.uniform(0.9, 1.0) for name, d in m.DIMENSIONS.items() if name != "l4"}
+    geometry = ks.Geometry(
+        **{
+            d.field: design.geometry[name] * rng.uniform(0.9, 1.0)
+            for name, d in ks.DIMENSIONS.items()
+            if name != "l4"
+        }
     )
-    tolerance = {name: rng.uniform(0.001, 0.02) * float(geometry[name]) for name in m.DIMENSIONS}
+    tolerance = {name: rng.uniform(0.001, 0.02) * float(geometry[name]) for name in ks.DIMENSIONS}
     return dataclasses.replace(
         design, geometry=dataclasses.replace(geometry, l4_mm=0.9 * geometry.la2_mm), tolerance=tolerance
     )
@@ -94,7 +98,7 @@ def test_gains_are_those_on_record(paper):
         loaded_um, stroke = STROKES[axis]
         assert paper[axis].loaded_stroke_um == pytest.approx(loaded_um, abs=0.051)
         assert paper[axis].stroke == pytest.approx(stroke, rel=3e-3)
-    assert [paper[axis].gain_unit for axis in m.AXES] == ["um/um"] * 3 + ["urad/um"] * 3
+    assert [paper[axis].gain_unit for axis in ks.AXES] == ["um/um"] * 3 + ["urad/um"] * 3
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -120,7 +124,7 @@ def test_derivatives_are_those_of_finite_differences(rng, axis):
     found = fits.sensitivities(design, [axis])[axis]
     scale = 1e6 if found.output_unit == "urad" else 1.0
     assert [effect.name for effect in found.dimensions] != []
-    assert {effect.name for effect in found.dimensions} == set(m.MOTIONS[axis].dimensions)
+    assert {effect.name for effect in found.dimensions} == set(ks.MOTIONS[axis].dimensions)
     for effect in found.dimensions:
         step = 2e-4 * effect.value
         # So short a stroke that the rotations are linear to 1e-12.
@@ -136,7 +140,7 @@ def test_derivatives_are_those_of_finite_differences(rng, axis):
         assert effect.relative_change_pct == pytest.approx(100 * wanted * effect.tolerance / gain, rel=1e-7)
         exact = float(moved(effect.tolerance)) / float(moved(0.0)) - 1
         assert effect.relative_change_exact_pct == pytest.approx(100 * exact, rel=1e-6)
-        leg = m.DIMENSIONS[effect.name].leg
+        leg = ks.DIMENSIONS[effect.name].leg
         ten_um = 0.01 if leg is None else 0.01 / float(geometry[leg])
         full = slope(lambda error, name=effect.name: moved(error, name, found.loaded_stroke_um), step)
         assert effect.output_change_per_10um == pytest.approx(ten_um * full, rel=1e-6)
@@ -148,14 +152,14 @@ def test_derivatives_are_those_of_finite_differences(rng, axis):
         )
         wanted = 100 * by * design.tolerance[name] / at_rest
         assert change == pytest.approx(wanted, rel=1e-6, abs=1e-9)
-    without = set(m.DIMENSIONS) - set(found.voltage_change_pct)
+    without = set(ks.DIMENSIONS) - set(found.voltage_change_pct)
     for name in without:
         assert float(held_output(axis, changed(geometry, name, 0.1), constants, actuation)) == at_rest
 
 
 def test_axes_that_are_alike_have_their_own_function(paper):
     """y and beta are computed as x and alpha; their own functions say the same."""
-    geometry, constants = m.Geometry(), fits.paper_design().constants
+    geometry, constants = ks.Geometry(), fits.paper_design().constants
     for axis, alike, scale in (("y", "x", 1), ("beta", "alpha", 1e6)):
         assert dataclasses.replace(paper[axis], axis=alike) == paper[alike]
         for effect in paper[axis].dimensions:
@@ -208,7 +212,7 @@ def test_shares_with_correlated_thicknesses_add_up_by_hand(paper, correlation):
 
 def test_without_tolerances_nothing_changes():
     design = fits.paper_design()
-    still = dataclasses.replace(design, tolerance=dict.fromkeys(m.DIMENSIONS, 0.0))
+    still = dataclasses.replace(design, tolerance=dict.fromkeys(ks.DIMENSIONS, 0.0))
     found = fits.sensitivities(still, ["z"])["z"]
     assert (found.rss_pct, found.worst_case_pct) == (0, 0)
     for effect in found.dimensions:
@@ -227,9 +231,9 @@ def test_modulus_and_width_change_no_motion(paper):
 
 
 def test_no_finite_number_is_refused():
-    thin = m.Geometry(t4_mm=jnp.asarray(1e-160))
+    thin = ks.Geometry(t4_mm=jnp.asarray(1e-160))
     with pytest.raises(fits.DataError, match=r"^z: .*finite"):
-        fits.sensitivities(fits.Design(thin, dict.fromkeys(m.DIMENSIONS, 0.0)), ["z"])
+        fits.sensitivities(fits.Design(thin, dict.fromkeys(ks.DIMENSIONS, 0.0)), ["z"])
 
 
 def test_the_json_is_that_of_the_schema(paper):

@@ -23,7 +23,7 @@ def respond(stage, time_s, voltage_V, start=None):
 
 
 def plays_of(rng):
-    return m.PrandtlIshlinskii(0.2, rng.uniform(0.02, 0.1, 3), rng.uniform(1, 20, 3), 2.0)
+    return m.hysteresis.PrandtlIshlinskii(0.2, rng.uniform(0.02, 0.1, 3), rng.uniform(1, 20, 3), 2.0)
 
 
 def full_stage(rng, law=None, **options):
@@ -79,7 +79,7 @@ def test_neighbouring_linear_parts_are_exact_and_substeps_converge(rng):
     exact = 2 * 0.3 * states(*plant, time_s * np.arange(SAMPLES), voltage_V, "first")[:, 1]
     joined = m.Stage.of(driver=driver, piezo=m.Piezo(0.3), mechanics=mechanics)
     np.testing.assert_allclose(respond(joined, time_s, voltage_V), exact, rtol=0, atol=1e-12 * 40)
-    law = m.PrandtlIshlinskii(0.3, np.zeros(1), np.zeros(1))
+    law = m.hysteresis.PrandtlIshlinskii(0.3, np.zeros(1), np.zeros(1))
     errors = []
     for substeps in (2, 8):
         parted = m.Stage.of(driver=driver, law=law, mechanics=mechanics, substeps=substeps)
@@ -194,9 +194,9 @@ def test_new_data_of_the_same_shape_compile_nothing(rng):
 
 def test_parts_can_be_swapped_inserted_appended_and_taken_out(rng):
     stage = full_stage(rng).freeze("driver.gain", "sensor")
-    other = stage.swap("hysteresis", m.Dahl(0.4, 1.0, 10.0))
-    assert isinstance(other["hysteresis"], m.Dahl)
-    assert isinstance(stage["hysteresis"], m.PrandtlIshlinskii)
+    other = stage.swap("hysteresis", m.hysteresis.Dahl(0.4, 1.0, 10.0))
+    assert isinstance(other["hysteresis"], m.hysteresis.Dahl)
+    assert isinstance(stage["hysteresis"], m.hysteresis.PrandtlIshlinskii)
     longer = other.append("second", m.Sensor(2.0)).insert(3, "second_mode", m.Mechanics(300.0, 0.02))
     assert longer.names == ("driver", "hysteresis", "mechanics", "second_mode", "sensor", "second")
     assert longer.frozen == ("driver.gain", "sensor")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fits
-import microid as m
+from microid import kinetostatics as ks
 
 # Table 1 of the paper; l is assumed.
 TABLE = {
@@ -27,22 +27,22 @@ def written(tmp_path):
 
 
 def sizes(design):
-    return {name: float(design.geometry[name]) for name in m.DIMENSIONS}
+    return {name: float(design.geometry[name]) for name in ks.DIMENSIONS}
 
 
 def random_design(rng):
-    geometry = m.Geometry(
-        **{m.DIMENSIONS[name].field: jnp.asarray(value * rng.uniform(0.85, 0.99)) for name, value in TABLE.items()},
+    geometry = ks.Geometry(
+        **{ks.DIMENSIONS[name].field: jnp.asarray(value * rng.uniform(0.85, 0.99)) for name, value in TABLE.items()},
     )
     # The paper's l4 is as long as its leg.
     geometry = dataclasses.replace(geometry, l4_mm=geometry.la2_mm)
     return fits.Design(
         geometry=geometry,
-        tolerance={name: float(rng.uniform(0, 0.05) * geometry[name]) for name in m.DIMENSIONS},
+        tolerance={name: float(rng.uniform(0, 0.05) * geometry[name]) for name in ks.DIMENSIONS},
         level=int(rng.integers(2)),
         guides=rng.uniform(0, 9),
         youngs_modulus_GPa=rng.uniform(50, 400),
-        actuation=m.Actuation(*(jnp.asarray(value) for value in rng.lognormal(1, 3, 8))),
+        actuation=ks.Actuation(*(jnp.asarray(value) for value in rng.lognormal(1, 3, 8))),
         together=(fits.Together(("t1", "l5", "alpha3"), rng.uniform(-0.4, 1)), fits.Together(("R", "J"), -1.0)),
     )
 
@@ -65,7 +65,7 @@ def test_the_file_holds_table_1_in_plain_toml(written):
     assert table["material"] == {"youngs_modulus": {"value": 206.0, "unit": "GPa"}, "guides": 4.0}
     assert table["together"][1] == {"dimensions": ["l6", "l7"], "correlation": -1.0}
     comments = {line.split(" = ")[0]: line.split("#")[1] for line in written[1].splitlines() if " }  # " in line}
-    for name, dimension in m.DIMENSIONS.items():
+    for name, dimension in ks.DIMENSIONS.items():
         assert dimension.meaning in comments[name]
 
 
@@ -233,13 +233,13 @@ def test_files_that_are_no_stages_are_refused(tmp_path, kind):
 def test_impossible_designs_are_refused_without_a_file_too():
     design = fits.paper_design()
     with pytest.raises(fits.DataError, match=r"^geometry\.l1: .*la1 = 9 mm"):
-        dataclasses.replace(design, geometry=m.Geometry(l1_mm=jnp.asarray(9.1)))
+        dataclasses.replace(design, geometry=ks.Geometry(l1_mm=jnp.asarray(9.1)))
     with pytest.raises(fits.DataError, match=r"^geometry\.t2: .*none"):
         dataclasses.replace(design, tolerance={name: 0.001 for name in TABLE if name != "t2"})
     with pytest.raises(fits.DataError, match=r"^geometry\.t3: .*unknown"):
         dataclasses.replace(design, tolerance=design.tolerance | {"t3": 0.02})
     with pytest.raises(fits.DataError, match=r"^actuation\.mass_z_kg: "):
-        dataclasses.replace(design, actuation=m.Actuation(mass_z_kg=jnp.asarray(0.0)))
+        dataclasses.replace(design, actuation=ks.Actuation(mass_z_kg=jnp.asarray(0.0)))
 
 
 def test_correlations_are_those_of_the_groups():

@@ -177,16 +177,18 @@ def test_derivatives_by_parameters_are_those_of_finite_differences(rng, tmp_path
 def test_what_is_not_plain_is_left_to_jax(rng, tmp_path):
     stage, uncertainty = draw(rng)
     place = tmp_path / "s.json"
-    creep, slew = (next(effect for effect in m.EFFECTS if effect.name == name) for name in ("creep", "slew_limit"))
+    creep, slew = (
+        next(effect for effect in m.effects.EFFECTS if effect.name == name) for name in ("creep", "slew_limit")
+    )
     with pytest.raises(LookupError, match="SlewLimit has no form"):
         form_of(slew.__name__)
     assert saved(place, stage, uncertainty) is not None
     for other in (
         m.Stage(stage.parts, stage.names, "smooth"),
         stage.swap("hysteresis", m.Piezo(0.1)),
-        m.extend(stage, creep(0.01, 0.1, 0.05)),
-        m.extend(stage, slew(50.0)),
-        stage.swap("hysteresis", m.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)),
+        m.effects.extend(stage, creep(0.01, 0.1, 0.05)),
+        m.effects.extend(stage, slew(50.0)),
+        stage.swap("hysteresis", m.hysteresis.PrandtlIshlinskii(0.2, np.ones(1), np.ones(1), 0.0)),
         stage.swap("driver", m.Driver(1e-3, -1.0)),
     ):
         assert saved(place, other) is None

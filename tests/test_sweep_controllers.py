@@ -13,7 +13,8 @@ from fits.control._gains import GAINS
 from fits.io._record import Reference
 from fits.sweeps._spec import chunk_count, compute_chunk
 from fits.sweeps._stages import memory_before, nominal_stage, varied
-from microid import BPPID, CMACPID, PID, ResonantPID, Start, margins, simulate_loop
+from microid import Start
+from microid.control import BPPID, CMACPID, PID, ResonantPID, margins, simulate_loop
 
 HEAD = """
 schema = "microid.sweep/1"

@@ -236,11 +236,27 @@ def test_rows_that_failed_are_drawn_as_such_and_names_whole():
     axes, key = _parallel(rows).axes
     assert key.get_ylabel() == "width_pct"
     said = [text.get_text() for text in axes.texts]
-    for words in ("mechanics.gain", "program.shape", "width_pct", "sine", "triangle", "1.5", "9"):
+    for words in ("mechanics.gain", "program.shape", "width_pct", "sine", "triangle", "1", "2", "9"):
         assert words in said
     red = [line for line in axes.lines if line.get_color() is not None and tuple(line.get_color()[:1]) == (0.8,)]
     assert len(red) == 3  # two rows, and the key
+    # Few values have a tick each, and none stands between them.
+    assert "1.5" not in said
     assert _wrapped("hysteresis.density.packed_um", 12) == "hysteresis.\ndensity.\npacked_um"
+
+
+def test_cells_without_a_row_are_said_to_be_white():
+    swept = {"mechanics.gain": np.array([1.0, 2.0, 2.0]), "program.bias_V": np.array([0.0, 0.0, 5.0])}
+    for keep, words in ((slice(3), "white: no row"), (slice(2), ""), (slice(1, 3), "")):
+        some = {name: values[keep] for name, values in swept.items()}
+        rows = _Rows(some, {}, "width_pct", np.array([1.0, 2.0, 3.0])[keep])
+        assert _heat(rows, tuple(some)).axes[0].get_title("left") == words
+
+
+def test_help_shows_the_options_of_a_sweep():
+    told = run("sweep", "--help").stdout
+    for option in ("--out DIR", "--resume", "--cluster", "--json", "--quiet"):
+        assert option in told
 
 
 def test_logarithmic_parameters_have_logarithmic_coordinates_and_failures_at_the_rim_are_whole():

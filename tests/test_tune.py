@@ -97,10 +97,10 @@ def test_the_steepest_slope_is_that_of_the_major_loop(rng):
     found = fits.steepest_slope(m.Stage.of(hysteresis=model))
     assert found == pytest.approx(expected, rel=0.02)
     assert fits.steepest_slope(stage_of(PLANT)) is None
-    plays = m.PrandtlIshlinskii(0.1, np.array([0.2, 0.3]), np.array([1.0, 2.0]), 0.0)
+    plays = m.hysteresis.PrandtlIshlinskii(0.1, np.array([0.2, 0.3]), np.array([1.0, 2.0]), 0.0)
     assert fits.steepest_slope(m.Stage.of(hysteresis=plays)) == pytest.approx(0.6)
     with pytest.raises(fits.DataError, match="is a Dahl"):
-        fits.steepest_slope(m.Stage.of(law=m.Dahl(0.1, 0.05, 1.0, 1.0)))
+        fits.steepest_slope(m.Stage.of(law=m.hysteresis.Dahl(0.1, 0.05, 1.0, 1.0)))
 
 
 @pytest.fixture(scope="module")

@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     from fits.sweeps._show import describe_sweep, summarise
     from fits.sweeps._spec import read_sweep
     from fits.sweeps._store import RESULTS, TABLE
-    from microid import AXES, CONTROLLERS, MOTIONS, Hold, Preisach, Stage
+    from microid import Hold, Preisach, Stage
+    from microid.control import CONTROLLERS
+    from microid.kinetostatics import AXES, MOTIONS
 else:
     __getattr__ = late(__name__, __file__)[1]

@@ -18,6 +18,13 @@ class _Sweep(click.Group):
             args = ["run", *args]
         return super().parse_args(ctx, args)
 
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Show the options of a run of a file, too, whose command nobody names."""
+        super().format_options(ctx, formatter)
+        shown = (each.get_help_record(ctx) for each in self.commands["run"].params if isinstance(each, click.Option))
+        with formatter.section("Options with SWEEP.toml"):
+            formatter.write_dl([one for one in shown if one is not None])
+
 
 @click.group(cls=_Sweep, invoke_without_command=True, subcommand_metavar="SWEEP.toml | show DIR [OPTIONS]")
 @click.option(

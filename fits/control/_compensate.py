@@ -30,7 +30,9 @@ from fits.loop._surface import Surface
 from fits.stage._encode import encode
 from fits.stage._model_file import AnyModel, model_given
 from fits.stage._plain_stage import plain_model
-from microid import AbstractEffect, AbstractLinear, GridDensity, Preisach, Reversible, Stage, Start, innermost
+from microid import AbstractLinear, Preisach, Reversible, Stage, Start, innermost
+from microid.densities import GridDensity
+from microid.effects import AbstractEffect
 
 Way = Literal["static", "dynamic"]
 
@@ -129,7 +131,7 @@ def _led(
         raise DataError(
             f"{reference.source}: sample {k + 1} (time {reference.time_s[k]:g} s) needs a command of "
             f"{asked_V[k]:.6g} V to make up for the driver's lag, but {bind}; slow the reference down, keep it away "
-            "from the ends of the range, or have the command clipped there."
+            "from the ends of the range, or have it clipped to the nearest that can be reached."
         )
     cut = excess_V > _SHOWS * width_V
     said = f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."
@@ -149,7 +151,7 @@ def plain_loop_of(model: Preisach) -> PlainLoop:
 
 
 def plain_of(stage: Stage) -> Stage:
-    """The same stage without effects of `microid.EFFECTS`; itself where it has none."""
+    """The same stage without effects of `microid.effects.EFFECTS`; itself where it has none."""
     if not any(isinstance(part, AbstractEffect) for part in stage.parts):
         return stage
     parts = {

@@ -72,8 +72,8 @@ def follow(
             f"{reference.source}: sample {k + 1} (time {time_s[k]:g} s) {asked}, but "
             f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because "
             f"{binding(law, limits)}; {int(clipped.sum())} of {len(wanted)} samples are out of reach: shift or "
-            f"shrink the reference,{' slow it down,' if doubt else ''} or have it clipped to the nearest that can be "
-            "reached."
+            f"shrink the reference,{' slow it down,' if doubt else ''} "
+            "or have it clipped to the nearest that can be reached."
         )
     return voltage, clipped
 
@@ -108,8 +108,10 @@ def beside_effects(
     time_s, wanted = reference.time_s, np.asarray(reference.displacement_um)
     asked, before = wanted, np.inf
     # Each round reduces the error to a few percent of what it was.
-    for _ in range(12):
-        found = invert(Reference(time_s, asked, reference.source))
+    for k in range(12):
+        # What is asked of the plain stage is another displacement than the reference.
+        source = f"{reference.source}, less what the effects of the model add" if k else reference.source
+        found = invert(Reference(time_s, asked, source))
         played = play(Record(time_s, found.voltage_V, None, source=reference.source))
         change = played - found.displacement_um
         moved = float(np.max(np.abs(wanted - change - asked)))

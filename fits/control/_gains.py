@@ -13,7 +13,8 @@ import numpy as np
 from fits.control._tune import parameter_values
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_JSON_BYTES, parse_json, read_text
-from microid import CONTROLLERS, PID, AbstractController, parameter_table, settings_of
+from microid import parameter_table
+from microid.control import CONTROLLERS, PID, AbstractController, settings_of
 
 GAINS = ("proportional_V_per_um", "integral_V_per_um_s", "derivative_V_s_per_um")
 PID_SETTINGS = {setting.name: setting for setting in settings_of(PID)}

@@ -22,6 +22,7 @@ from fits.io._errors import DataError
 from fits.io._record import Reference
 from fits.loop._run import initial_state
 from fits.stage._run import as_stage, place_of_hysteresis, range_of
+from microid import control as ctl
 
 Feedforward = Literal["none", "static", "dynamic"]
 _FEWEST = 16
@@ -57,7 +58,7 @@ def setup(
     stage = as_stage(model).with_hold("zero")
     interval = _interval_s(reference)
     try:
-        sampled = m.SampledStage(stage, interval)
+        sampled = ctl.SampledStage(stage, interval)
     except ValueError as error:
         raise DataError(f"the model cannot be stepped from sample to sample: {error}", of_model=True) from error
     wanted, remarks = np.asarray(reference.displacement_um), list[str]()
@@ -73,7 +74,7 @@ def setup(
         static_V = ahead_V = (wanted - offset) / gain
         if feedforward == "dynamic":
             try:
-                ahead_V = np.asarray(m.two_degrees(stage, interval, jnp.asarray(wanted)).feedforward_V)
+                ahead_V = np.asarray(ctl.two_degrees(stage, interval, jnp.asarray(wanted)).feedforward_V)
             except ValueError as error:
                 raise DataError(f"the model has no dynamic inverse: {error}", of_model=True) from error
         if feedforward != "none" and not np.array_equal(np.clip(ahead_V, *limits), ahead_V):
@@ -122,13 +123,16 @@ def _interval_s(reference: Reference) -> float:
     return interval
 
 
-def own_settings(controller: type[m.AbstractController]) -> list[m.Setting]:
+def own_settings(controller: type[ctl.AbstractController]) -> list[ctl.Setting]:
     """Settings of a controller beside the fields of its PID controller."""
-    return [setting for setting in m.settings_of(controller) if setting.name not in PID_SETTINGS]
+    return [setting for setting in ctl.settings_of(controller) if setting.name not in PID_SETTINGS]
 
 
 def with_defaults(
-    settings: Collection[m.Setting], stated: Mapping[str, Any], task: m.ControlTask, place: Callable[[str], str]
+    settings: Collection[ctl.Setting],
+    stated: Mapping[str, Any],
+    task: ctl.ControlTask,
+    place: Callable[[str], str],
 ) -> tuple[dict[str, Any], list[str]]:
     """Settings as stated, or else their defaults, with what is to be said of these; `place` names one to the user."""
     found: dict[str, Any] = {}
@@ -174,12 +178,12 @@ class Loop:
 
     def run(
         self,
-        controller: m.AbstractController,
+        controller: ctl.AbstractController,
         noise_um: np.ndarray | None,
         resolution_V: float | None,
         plant: m.Stage,
-    ) -> m.ControlledRun:
-        return m.simulate_loop(
+    ) -> ctl.ControlledRun:
+        return ctl.simulate_loop(
             controller,
             plant,
             jnp.asarray(self.ready.reference_um),
@@ -192,10 +196,10 @@ class Loop:
             start=self.ready.start,
         )
 
-    def margins(self, controller: m.AbstractController) -> list[m.Margins]:
+    def margins(self, controller: ctl.AbstractController) -> list[ctl.Margins]:
         """Margins of every plant, at the steepest slope of its hysteresis."""
         return [
-            m.margins(controller.linear(), one, delay=self.delay, slope_um_per_V=slope_array(one))
+            ctl.margins(controller.linear(), one, delay=self.delay, slope_um_per_V=slope_array(one))
             for one in self.plants
         ]
 
@@ -204,8 +208,8 @@ class Loop:
 class Made:
     """A controller, the PID controller that it is or was made around, and the tuning if no gains were given."""
 
-    controller: m.AbstractController
-    pid: m.PID
+    controller: ctl.AbstractController
+    pid: ctl.PID
     tuning: Tuning[Any] | None
     remarks: list[str]
 
@@ -223,21 +227,21 @@ class Maker:
 
     def make(self, name: str, given: Given | None, frequency_Hz: Sequence[float]) -> Made:
         """Make a controller by its kind, tuned if no gains are given; frequencies are those of resonators."""
-        loop, kind = self.loop, m.CONTROLLERS[name]
+        loop, kind = self.loop, ctl.CONTROLLERS[name]
         tuning: Tuning[Any] | None = None
         if given is None:
             self.progress("start by Ziegler and Nichols")
             pid = relay_start(loop.plants, loop.ready.interval_s, delay=loop.delay)
         else:
             fields = {**given.pid, "interval_s": loop.ready.interval_s}
-            pid = m.PID(**{field: jnp.asarray(value) for field, value in fields.items()})
+            pid = ctl.PID(**{field: jnp.asarray(value) for field, value in fields.items()})
         limits_V = tuple(jnp.asarray(limit) for limit in loop.ready.limits_V)
         pid = eqx.tree_at(lambda pid: (pid.lower_V, pid.upper_V), pid, limits_V)
         if given is None:
             tuning = self._tuned(pid)
             pid = tuning.controller
         remarks = [] if tuning is None else list(tuning.remarks)
-        if kind is m.PID:
+        if kind is ctl.PID:
             return Made(pid, pid, tuning, remarks)
         own, said = self._stated(kind, given, frequency_Hz)
         if kind.learns:
@@ -248,7 +252,7 @@ class Maker:
             return "frequency" if setting == "frequency_Hz" else f"controller {name}: {setting}"
 
         ready, stage = loop.ready, loop.plants[0]
-        task = m.ControlTask(
+        task = ctl.ControlTask(
             stage,
             ready.interval_s,
             lambda: ready.reference_um,
@@ -261,7 +265,7 @@ class Maker:
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
         try:
-            made = kind.of(pid, numbers, m.ControlledPlant(stage, slope_array(stage), loop.delay))
+            made = kind.of(pid, numbers, ctl.ControlledPlant(stage, slope_array(stage), loop.delay))
         except ValueError as error:
             raise DataError(f"{name}: {error}; choose pid.") from error
         if given is not None or kind.learns:
@@ -298,7 +302,7 @@ class Maker:
         return controller
 
     def _stated(
-        self, kind: type[m.AbstractController], given: Given | None, frequency_Hz: Sequence[float]
+        self, kind: type[ctl.AbstractController], given: Given | None, frequency_Hz: Sequence[float]
     ) -> tuple[dict[str, np.ndarray], list[str]]:
         """Parameters that are given beside those of the PID controller, by path, and remarks on them."""
         own = {} if given is None else {name: x for name, x in given.others.items() if name in kind.own}

@@ -15,7 +15,8 @@ from fits.io._errors import DataError
 from fits.io._length import length
 from fits.loop._result import FitError, FitStatus
 from fits.stage._model_file import AnyModel
-from microid import AbstractController, Coordinates, ParameterInfo, Stage, Start, parameter_table
+from microid import Coordinates, ParameterInfo, Stage, Start, parameter_table
+from microid.control import AbstractController
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
 
@@ -68,8 +69,8 @@ def tune_controller(
     `CMACPID` have the margins of the PID controller that they are at first. Plants are one stage, or several of one
     structure, as from `draw_plants`; the first is the nominal one. There are one or several references, shape `(t,)`
     or `(r, t)`, with the feedforward and the noise of each, or of all, in the same shapes; none by default. The same
-    noise is used throughout. See `Goal` for cost and limits, and `microid.simulate_loop` for delay, resolution and
-    start. The first `skip` samples do not count.
+    noise is used throughout. See `Goal` for cost and limits, and `microid.control.simulate_loop` for delay,
+    resolution and start. The first `skip` samples do not count.
 
     Parameters that move are those of the paths in `free`, such as `"pid"` or `"integral_V_per_um_s"`; by default
     gains: what cannot be negative, is not zero and is no time. There are so many places to search from, drawn by the

@@ -12,7 +12,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from fits.io._kept import kept
-from microid import AbstractController, ControlledRun, Coordinates, Margins, Stage, Start, margins, simulate_loop
+from microid import Coordinates, Stage, Start
+from microid.control import AbstractController, ControlledRun, Margins, margins, simulate_loop
 
 _Controller = TypeVar("_Controller", bound=AbstractController)
 # Every gain is searched for within `exp` of this of its start, to either side.
@@ -30,9 +31,10 @@ class Goal:
     feedback adds to the feedforward, or to the command before the first sample, `rate_um_per_V` the weight `w_Δ` of
     the change of the command between samples, whose largest is limited by `command_step_max_V`.
 
-    A limit of None is none. Margins and peak are those of the linearised loop of every plant; see `microid.Margins`.
-    The overshoot is the displacement beyond the range that the reference and the rest before it span, in percent of
-    that range; none where they span nothing. Limits of the command are short of where the controller cuts it off.
+    A limit of None is none. Margins and peak are those of the linearised loop of every plant; see
+    `microid.control.Margins`. The overshoot is the displacement beyond the range that the reference and the rest
+    before it span, in percent of that range; none where they span nothing. Limits of the command are short of where
+    the controller cuts it off.
     """
 
     effort_um_per_V: float = 0.0

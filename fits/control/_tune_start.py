@@ -13,7 +13,9 @@ from fits.io._errors import DataError
 from fits.io._kept import kept
 from fits.stage._model_file import AnyModel, model_given
 from fits.stage._run import as_stage, place_of_hysteresis
-from microid import PID, PrandtlIshlinskii, Preisach, Stage, loop_gain, margins
+from microid import Preisach, Stage
+from microid.control import PID, loop_gain, margins
+from microid.hysteresis import PrandtlIshlinskii
 
 
 @dataclass(frozen=True)

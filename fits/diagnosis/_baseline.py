@@ -21,7 +21,8 @@ from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
 from fits.stage._solve import Problem, prior_precision
 from fits.stats._noise import rough_noise_um
-from microid import AbstractEffect, Hold, Mechanics, Stage, extend, host
+from microid import Hold, Mechanics, Stage
+from microid.effects import AbstractEffect, extend, host
 
 # A voltage has been at an end once it comes this close, as a part of the range.
 _NEAR = 0.01

@@ -12,7 +12,7 @@ from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.stats._compare import improvement_z
-from microid import EFFECTS, AbstractEffect
+from microid.effects import EFFECTS, AbstractEffect
 
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.

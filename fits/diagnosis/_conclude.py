@@ -69,7 +69,7 @@ def conclude(
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
-    model, kept, remarks = found.model, found.causes, [*_remarks(ready, records), *minor]
+    model, kept, remarks = found.model, found.causes, [*_remarks(ready, records)]
     weak = max((cause.z for cause in kept), default=0.0) < thresholds.strong_z
     # Of what one run had of its own other runs show nothing.
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
@@ -80,12 +80,14 @@ def conclude(
         suspects = ", ".join(cause.name.replace("_", " ") for cause in kept)
         why = "what was held out is predicted worse with that"
         if misfit.share < thresholds.explained_share:
-            why = f"that explains only {misfit.share:.0%} of it"
+            why = f"that explains only {100 * misfit.share:.0f} % of it"
         remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
-    elif kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
+    else:
+        remarks += minor
+    if kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
         own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if one.per_run}))
         remarks.append(f"{own}: not the same in the runs held out, so that the stage is left plain")
         extension = without_effects(ready, extension)

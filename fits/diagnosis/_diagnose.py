@@ -53,9 +53,9 @@ def diagnose(
 ) -> Diagnosis:
     """Say what the simulation of a stage gets wrong, name the cause, extend the model and measure the gain.
 
-    The plain stage is fitted to all runs. Each effect of `microid.EFFECTS` is then asked for by a score test: its
-    signature in these very runs, projected off everything that the re-fitted stage can follow. The leaders are fitted
-    jointly with the stage, one cause at a time, until chance explains the rest.
+    The plain stage is fitted to all runs. Each effect of `microid.effects.EFFECTS` is then asked for by a score test:
+    its signature in these very runs, projected off everything that the re-fitted stage can follow. The leaders are
+    fitted jointly with the stage, one cause at a time, until chance explains the rest.
 
     Parameters
     ----------

@@ -16,7 +16,8 @@ from fits.diagnosis._baseline import Baseline, with_effects
 from fits.diagnosis._records import LONG
 from fits.io._record import Record
 from fits.stage._motion import Prepared, prepare, program, signals
-from microid import AbstractEffect, Coordinates, Sensor, Signal
+from microid import Coordinates, Sensor, Signal
+from microid.effects import AbstractEffect
 
 # Number of programs, of some 7 MB each, from which on they make room for each other.
 _MANY = 400

@@ -195,9 +195,11 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
 def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> str:
     *others, last = (name.replace("_", " ") for name in names)
     if not others:
+        # Evidence that was sought, not supposed, is another number: the two are not to stand side by side.
+        if present < 1.0:
+            return f"It would show {last} of the size that is suspected by {z:.1f} standard deviations."
         return (
-            f"It would show {last} of the size that is suspected by {z:.1f} standard deviations, where the records "
-            f"at hand show it by {present:.1f}."
+            f"It would show {last} of the size that is suspected {z / present:.1f} times as clearly as these records."
         )
     listed = f"{', '.join(others)} and {last}"
     if z < _TOLD_APART and column:

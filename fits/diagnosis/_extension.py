@@ -20,7 +20,8 @@ from fits.loop._run import Run
 from fits.stage._motion import signals
 from fits.stage._run import project_out
 from fits.stats._compare import is_worse, sd_of_difference
-from microid import AbstractEffect, Stage
+from microid import Stage
+from microid.effects import AbstractEffect
 
 _ROUNDS = 6
 

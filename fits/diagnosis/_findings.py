@@ -22,8 +22,8 @@ from fits.diagnosis._select import Cause, Selection
 from fits.loop._result import ParameterEstimate
 from fits.stats._held import Held
 from fits.stats._metrics import TWO_SIDED_95
-from microid import EFFECTS, AbstractEffect, Coordinates
-from microid.effects import Statistic, card_of
+from microid import Coordinates
+from microid.effects import EFFECTS, AbstractEffect, Statistic, card_of
 
 # Standard deviations from zero beyond which a run shows an effect.
 _SHOWS = 2.0

@@ -106,9 +106,8 @@ def worth_naming(
         name, (part, kept) = min(parts.items(), key=lambda item: item[1][0])
         why = "what was held out is predicted worse with it than with the other causes alone"
         if part >= 0:
-            why = (
-                f"it would explain {part:.0%} of what the other causes leave, which what makes the rest may make, too"
-            )
+            share = f"{100 * part:.0f} % of what the other causes leave"
+            why = f"it would explain {share}, and what makes the rest may look like that"
         said.append(f"{name.replace('_', ' ')} is not named: {why}")
         found = replace(found, causes=tuple(found.causes[k] for k in kept), model=_refit_of(found, kept, 3))
 

@@ -12,7 +12,7 @@ from fits.diagnosis._regression import Kinds, Regression, regress, saturating
 from fits.io._record import Record
 from fits.loop._run import prepare_run
 from fits.stats._noise import Noise
-from microid import AbstractEffect
+from microid.effects import AbstractEffect
 
 _STEP = 1e-3
 # The farthest that a draw moves a coordinate, which are of the order of one.

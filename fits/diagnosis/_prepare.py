@@ -18,7 +18,8 @@ from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
 from fits.stage._solve import Problem
 from fits.stats._held import held_gain
-from microid import EFFECTS, Hold, Scales
+from microid import Hold
+from microid.effects import EFFECTS, Scales
 
 # A delay below this part of the sampling interval is no effect, but one of each run's own.
 _SKEW = 0.04

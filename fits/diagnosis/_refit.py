@@ -13,7 +13,7 @@ from fits.diagnosis._score import Scored, law_of
 from fits.io.columns import columns_beside
 from fits.io.columns.temperature import TEMPERATURE
 from fits.stats._score_test import BLOCK
-from microid import AbstractEffect
+from microid.effects import AbstractEffect
 
 _STEP = 1e-3
 # Standard deviations up to which a strength may be larger than it was found.

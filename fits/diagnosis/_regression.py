@@ -17,7 +17,8 @@ from fits.loop._prior import interpolation
 from fits.loop._run import Run
 from fits.stage._moments import Chain, linearise, pieces, propagated
 from fits.stage._run import ahead, place_of_hysteresis
-from microid import PLACES, AbstractEffect, Coordinates, Stage
+from microid import Coordinates, Stage
+from microid.effects import PLACES, AbstractEffect
 
 # Levels of the grid of the finer structure, how many random examples of it stand for all, and levels of a rough past.
 _FINE, _EXAMPLES, _PAST = 64, 120, 32

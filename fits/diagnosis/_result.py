@@ -195,7 +195,7 @@ class Diagnosis(AbstractSummary):
 
     def summary(self) -> str:
         """Say the verdict, the causes with their parameters in units, and the gain, in a few lines."""
-        lines = [f"{KINDS[self.verdict]}; noise {length(self.noise_um)}, {self.noise_source}"]
+        lines = [f"{KINDS[self.verdict]}; noise {length(self.noise_um)}, from {self.noise_source}"]
         for cause in self.causes:
             also = f", or {', '.join(cause.also_consistent)}" if cause.also_consistent else ""
             chance = f"{cause.p_family:.1g}" if cause.p_family >= SMALLEST_P else f"below {SMALLEST_P:.0e}"

@@ -13,7 +13,8 @@ from fits.diagnosis._projector import Projector, take_off
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
 from fits.stats._score_test import best_multiples, evidence, evidence_of, robust_z, squares
-from microid import AbstractEffect, Coordinates, Scales, host
+from microid import Coordinates
+from microid.effects import AbstractEffect, Scales, host
 
 _DRAWS = 2000
 # Share of a signature that must be left for the records to show it at all.

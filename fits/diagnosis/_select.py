@@ -23,8 +23,7 @@ from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.stats._score_test import standard_deviations
-from microid import EFFECTS
-from microid.effects import card_of
+from microid.effects import EFFECTS, card_of
 
 # Laws at most, as some causes come several times, sets of causes that are followed at a time, and rounds in which
 # others are fitted where none of the leaders holds.

@@ -206,7 +206,8 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
     guesses = []
     for quantity in map(known_quantity, missing):
         # Of a name like the column's, in a unit of it if there is such a one.
-        likely = [name for name in free if split_unit(name)[1] in quantity.powers] or free or ["NAME"]
+        likely = [name for name in free if split_unit(name)[1] in quantity.powers]
+        likely = likely or [name for name in free if split_unit(name)[1] is None] or free or ["NAME"]
         near = max(likely, key=lambda name: SequenceMatcher(None, quantity.column, name.lower()).ratio())
         free = [name for name in free if name != near]  # a column serves once
         stem, unit = split_unit(near)

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from fits.loop._path import Path
 from fits.loop._surface import Surface, spread
-from microid import GridDensity, Preisach, Reversible, Staircase, forest_sum, node_areas, remember
+from microid import Preisach, Reversible, Staircase, forest_sum, remember
+from microid.densities import GridDensity, node_areas
 
 
 class Grid(eqx.Module):

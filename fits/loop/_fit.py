@@ -27,10 +27,13 @@ from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._metrics import WHITE
 from fits.stats._noise import LOSSES
-from microid import FAMILIES, Preisach
+from microid import Preisach
+from microid.densities import FAMILIES
 
 # Families that are not grids are evaluated on at least this many levels.
 _SHAPE_LEVELS = 34
+# Of the speeds of two runs, from which they may tell more than a hysteresis.
+_OTHER_SPEED = 5.0
 
 
 @one_thread
@@ -59,7 +62,7 @@ def fit(
     records
         Runs of one rig, or one: records, or what `read_table` takes. Each has its own sensor offset.
     family, levels
-        Name in `microid.FAMILIES`, and number of switching voltages, chosen from the data by default.
+        Name in `microid.densities.FAMILIES`, and number of switching voltages, chosen from the data by default.
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     initial
@@ -114,6 +117,7 @@ def fit(
     progress("checking the records")
     miss, told = check_loops(runs, prepare, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
+    remarks += _of_speed(runs) if miss is not None and miss.far else []
     progress("comparing with the measurement")
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
     reports = [_report(found, surface, offset, run, **figures) for offset, run in zip(offsets, runs, strict=True)]
@@ -131,6 +135,22 @@ def fit(
         smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
     )
+
+
+def _of_speed(runs: Sequence[Run]) -> list[str]:
+    """What to do where runs that differ in speed are far from what a hysteresis, which knows none, makes of them."""
+    per_s = [np.median(np.abs(slopes[slopes != 0])) for slopes in map(_slopes_V_per_s, runs) if slopes.any()]
+    if len(per_s) < 2 or max(per_s) < _OTHER_SPEED * min(per_s):
+        return []
+    times = max(per_s) / min(per_s)
+    return [
+        f"the runs differ in speed by a factor of {times:.2g}, and a hysteresis alone knows no speed: fit a "
+        "whole stage to them, with driver and mechanics, or have it diagnosed"
+    ]
+
+
+def _slopes_V_per_s(run: Run) -> np.ndarray:
+    return np.diff(run.record.voltage_V) / np.diff(run.record.time_s)
 
 
 def correlated(samples: float, what: str) -> str:

@@ -75,7 +75,7 @@ class PlainModel(abc.ABC):
     @property
     @abc.abstractmethod
     def without_effects(self) -> "PlainModel":
-        """The same model without effects of `microid.EFFECTS`; itself where it has none."""
+        """The same model without effects of `microid.effects.EFFECTS`; itself where it has none."""
 
     @abc.abstractmethod
     def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:

@@ -99,7 +99,7 @@ def array_of(
 
 
 def _node_areas(levels: int) -> np.ndarray:
-    """Integrals of the hat functions of the nodes, in units of the range squared; see `microid.node_areas`."""
+    """Integrals of the hat functions of the nodes, in the range squared; see `microid.densities.node_areas`."""
     i, edge = np.arange(levels - 1), np.ones(levels)
     edge[[0, -1]] = 1 / 2
     area = np.tril(np.outer(edge, edge), -1)

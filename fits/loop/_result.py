@@ -154,9 +154,9 @@ class FitResult(AbstractSummary, Generic[_M]):
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter
-        raise KeyError(
-            f"no parameter {name!r} was fitted: choose one of {', '.join(p.name for p in self.parameters)}"
-        )
+        names = ", ".join(parameter.name for parameter in self.parameters)
+        known = f"choose one of {names}" if names else "a hysteresis has weights, in `weights_um`"
+        raise KeyError(f"no parameter {name!r} was fitted: {known}")
 
     @property
     def fitted_runs(self) -> tuple[RunReport, ...]:

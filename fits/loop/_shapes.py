@@ -17,7 +17,8 @@ from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run, simulate_run
 from fits.stats._noise import correlation_samples, shared_square
-from microid import FAMILIES, Coordinates, Preisach, Reversible
+from microid import Coordinates, Preisach, Reversible
+from microid.densities import FAMILIES
 
 # Steps at a time; every start gets these, the leading ones are followed while their cost falls.
 _STEPS = 60
@@ -88,7 +89,7 @@ def solve_shape(
     key: PRNGKeyArray,
     progress: Progress,
 ) -> tuple[Estimate, bool]:
-    """Fit a family of `microid.FAMILIES` that is not linear in its parameters, on the moments of the record alone.
+    """Fit one of `microid.densities.FAMILIES` that is not linear in its parameters, on a record's moments alone.
 
     The weight that holds the coordinates near zero is chosen by the evidence (MacKay's fixed point), and the noise is
     what this family leaves, which may be more than the grid's, in `hyper`. Returns the best of all starts, and

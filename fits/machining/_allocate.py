@@ -12,7 +12,7 @@ from fits.io._quantity import FloatArray
 from fits.machining._design import Design, lever_mm
 from fits.machining._gains import gain_model, gradient, hessian, inputs_of, twin
 from fits.machining._tolerances import check, check_independent, tolerances
-from microid import DIMENSIONS, Axis
+from microid.kinetostatics import DIMENSIONS, Axis
 
 Limit = Literal["three_sigma", "worst_case"]
 _POWERS: dict[Limit, int] = {"three_sigma": 2, "worst_case": 1}

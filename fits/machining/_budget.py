@@ -22,6 +22,7 @@ from fits.machining._gains import once_per_function, quick_jit
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import derivatives_of, output_scale, refuse_infinite
 from fits.stage._model_file import AnyModel, model_given
+from microid import kinetostatics as ks
 
 Measures = Literal["pzt", "x", "y", "z", "alpha", "beta", "gamma"]
 
@@ -56,7 +57,7 @@ class AxisBudget:
     out: the input stiffness then acts too. The measuring error of the sensor is None where it is not known.
     """
 
-    axis: m.Axis
+    axis: ks.Axis
     output_unit: str
     stroke: float
     piezo_sensitivity: float
@@ -74,8 +75,8 @@ class AxisBudget:
         """The larger driving error by size, with its sign."""
         return max(self.driving_highest, self.driving_lowest, key=abs)
 
-    def _total(self, machining: float) -> m.TotalError:
-        return m.total_error(self.driving, machining, self.measuring or 0.0)
+    def _total(self, machining: float) -> ks.TotalError:
+        return ks.total_error(self.driving, machining, self.measuring or 0.0)
 
     @property
     def signed(self) -> float:
@@ -111,7 +112,7 @@ class Budget(AbstractSummary):
     what a reader must know, one sentence each.
     """
 
-    axes: dict[m.Axis, AxisBudget]
+    axes: dict[ks.Axis, AxisBudget]
     driving: Driving
     measures: Measures
     noise_um: float
@@ -120,7 +121,7 @@ class Budget(AbstractSummary):
     level: int
     remarks: tuple[str, ...]
 
-    def __getitem__(self, axis: m.Axis) -> AxisBudget:
+    def __getitem__(self, axis: ks.Axis) -> AxisBudget:
         """Budget of an axis by its name."""
         return self.axes[axis]
 
@@ -155,7 +156,7 @@ def budget(
     design: Design,
     model: AnyModel,
     idle: IdleNoise,
-    axes: Sequence[m.Axis] = m.AXES,
+    axes: Sequence[ks.Axis] = ks.AXES,
     *,
     measures: Measures = "pzt",
     arm_mm: float | None = None,
@@ -179,7 +180,7 @@ def budget(
     noise_um = idle.error_um(zeroed)
     # In um, and in urad where the arm is known.
     measuring = {"um": noise_um, "rad": None if arm_mm is None else 1e3 * noise_um / arm_mm}
-    found = once_per_function(axes, lambda axis: _of_axis(design, axis, driving, measuring[m.MOTIONS[axis].unit]))
+    found = once_per_function(axes, lambda axis: _of_axis(design, axis, driving, measuring[ks.MOTIONS[axis].unit]))
     remarks = (*_remarks(design, found, driving, arm_mm), *(f"Idle record: {remark}" for remark in idle.remarks))
     return Budget(found, driving, measures, noise_um, zeroed, arm_mm, design.level, remarks)
 
@@ -193,7 +194,7 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
     error, highest_um = _loop(law, jnp.asarray(np.concatenate([rise, rise[-2::-1]])))
     # What the model calls a um is this many of the piezo.
     per_unit = 1.0
-    if measures != "pzt" and m.MOTIONS[measures].unit == "rad":
+    if measures != "pzt" and ks.MOTIONS[measures].unit == "rad":
         if arm_mm is None:
             raise DataError(
                 f"a model of {measures} measures a rotation by a displacement; say at which arm, such as 50 mm."
@@ -209,14 +210,14 @@ def _driving(design: Design, model: m.Preisach | m.Stage, measures: Measures, ar
 
 
 @quick_jit
-def _loop(law: m.Preisach, voltage_V: Float[Array, " n"]) -> tuple[m.DrivingError, Float[Array, ""]]:
+def _loop(law: m.Preisach, voltage_V: Float[Array, " n"]) -> tuple[ks.DrivingError, Float[Array, ""]]:
     """Driving error over a loop, and what the model moves up to its middle, which is the turn."""
-    error = m.driving_error(law, voltage_V)
+    error = ks.driving_error(law, voltage_V)
     turn = len(voltage_V) // 2
     return error, error.signed_um[turn] + error.slope_um_per_V * (voltage_V[turn] - voltage_V[0])
 
 
-def _of_axis(design: Design, axis: m.Axis, driving: Driving, measuring: float | None) -> AxisBudget:
+def _of_axis(design: Design, axis: ks.Axis, driving: Driving, measuring: float | None) -> AxisBudget:
     scale, unit = output_scale(axis)
     # The load takes a fixed part of any free elongation.
     loaded_um = derivatives_of(design, axis).loaded_stroke_um
@@ -240,8 +241,10 @@ def _combined(design: Design, slopes: Mapping[str, Array], scale: float) -> tupl
     return float(changes.sum()), float(np.abs(changes).sum()), math.sqrt(max(variance, 0.0))
 
 
-def _remarks(design: Design, axes: dict[m.Axis, AxisBudget], driving: Driving, arm_mm: float | None) -> Iterator[str]:
-    turning = [axis for axis in axes if m.MOTIONS[axis].unit == "rad"]
+def _remarks(
+    design: Design, axes: dict[ks.Axis, AxisBudget], driving: Driving, arm_mm: float | None
+) -> Iterator[str]:
+    turning = [axis for axis in axes if ks.MOTIONS[axis].unit == "rad"]
     if turning and arm_mm is None:
         yield (
             f"The measuring error of {', '.join(turning)} is left out: a displacement sensor reads a rotation at an "

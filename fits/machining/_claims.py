@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-import microid as m
 from fits.machining._design import TOLERANCE_MM, Design
 from fits.machining._gains import quick_jit
 from fits.machining._sensitivity import AxisSensitivity, DimensionEffect, SensitivityReport, gains_at, sensitivities
+from microid import kinetostatics as ks
 
 Verdict = Literal["agree", "partly", "disagree"]
 # Below this part of the largest effect of an axis, one can be neglected; from the other on, it is severe.
@@ -27,7 +27,7 @@ class Claim:
     The verdict is `agree`, `partly` or `disagree`. A number with its unit decides, and the reason says what it is.
     """
 
-    axes: tuple[m.Axis, ...]
+    axes: tuple[ks.Axis, ...]
     statement: str
     verdict: Verdict
     number: float
@@ -135,12 +135,12 @@ def sign_change_guides(design: Design) -> float | None:
 
 
 @quick_jit
-def _sign_change(geometry: m.Geometry, constants: m.Constants) -> Float[Array, ""]:
+def _sign_change(geometry: ks.Geometry, constants: ks.Constants) -> Float[Array, ""]:
     g = geometry
-    one_leg = m.guide_stiffness_N_per_um(g.l2_mm, g.t2_mm, g.l3_mm, constants) / constants.guides
+    one_leg = ks.guide_stiffness_N_per_um(g.l2_mm, g.t2_mm, g.l3_mm, constants) / constants.guides
 
     def stiffnesses(t1_mm: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        port = m.bridge(g.l1_mm, t1_mm, g.la1_mm, g.alpha1_rad, constants)
+        port = ks.bridge(g.l1_mm, t1_mm, g.la1_mm, g.alpha1_rad, constants)
         return port.K12_N_per_um, port.K22_N_per_um
 
     (across, back), (across_slope, back_slope) = jax.jvp(stiffnesses, (g.t1_mm,), (jnp.ones_like(g.t1_mm),))
@@ -183,7 +183,7 @@ def _ratio(one: float, other: float) -> float:
 
 def _shape_of_curve(design: Design, effect: DimensionEffect) -> tuple[float, bool, str]:
     """How far the output in z over errors of a dimension is off a line, in %; whether it goes one way; in words."""
-    names = m.MOTIONS["z"].dimensions
+    names = ks.MOTIONS["z"].dimensions
     width = effect.tolerance or TOLERANCE_MM
     errors = np.zeros((41, len(names)))
     errors[:, names.index(effect.name)] = np.linspace(-width, width, len(errors))

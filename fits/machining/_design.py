@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-import microid as m
 from fits.io._errors import DataError
 from fits.io._typed import nearest
+from microid import kinetostatics as ks
 
 TOLERANCE_MM = 0.02
 LARGEST_ANGLE_RAD = 1.5
@@ -21,9 +21,10 @@ _MOST_GUIDES = 1000
 
 @dataclass(frozen=True)
 class Together:
-    """Dimensions, named as in `microid.DIMENSIONS`, whose errors go together with a correlation of any two, -1 to 1.
+    """Dimensions whose errors go together with a correlation of any two, -1 to 1.
 
-    One offset of a wire cut, for example, shifts several thicknesses.
+    They are named as in `microid.kinetostatics.DIMENSIONS`. One offset of a wire cut, for example, shifts several
+    thicknesses.
     """
 
     dimensions: tuple[str, ...]
@@ -43,12 +44,12 @@ class Design:
     A `DataError` says that anything in it is impossible, beginning with its place, such as `geometry.t2`.
     """
 
-    geometry: m.Geometry
+    geometry: ks.Geometry
     tolerance: dict[str, float]
     level: int = 1
     guides: float = 4.0
     youngs_modulus_GPa: float = 206.0
-    actuation: m.Actuation = field(default_factory=m.Actuation)
+    actuation: ks.Actuation = field(default_factory=ks.Actuation)
     together: tuple[Together, ...] = ()
 
     def __post_init__(self) -> None:
@@ -56,9 +57,9 @@ class Design:
             raise DataError(fault)
 
     @property
-    def constants(self) -> m.Constants:
+    def constants(self) -> ks.Constants:
         """What enters the motion functions beside their arguments."""
-        return m.constants_of(self.geometry, self.level, 1e3 * self.youngs_modulus_GPa, self.guides)
+        return ks.constants_of(self.geometry, self.level, 1e3 * self.youngs_modulus_GPa, self.guides)
 
     def with_tolerance(self, length_mm: float) -> "Design":
         """Give every length this tolerance, and every angle what an error of that size makes of it at its leg."""
@@ -80,18 +81,18 @@ def paper_design(tolerance_mm: float = TOLERANCE_MM) -> Design:
     All lengths have one tolerance. The paper gives none for angles (erratum 9), here that of a length over its leg,
     and no value for `l` (erratum 7), here 40 mm.
     """
-    geometry = m.Geometry()
+    geometry = ks.Geometry()
     return Design(geometry, uniform_tolerance(geometry, tolerance_mm))
 
 
-def uniform_tolerance(geometry: m.Geometry, length_mm: float) -> dict[str, float]:
+def uniform_tolerance(geometry: ks.Geometry, length_mm: float) -> dict[str, float]:
     """Tolerance of every dimension in its unit that goes with one of all lengths."""
-    return {name: length_mm / lever_mm(geometry, name) for name in m.DIMENSIONS}
+    return {name: length_mm / lever_mm(geometry, name) for name in ks.DIMENSIONS}
 
 
-def lever_mm(geometry: m.Geometry, name: str) -> float:
+def lever_mm(geometry: ks.Geometry, name: str) -> float:
     """Length of the leg at whose end an error of an angle is counted as a length; 1 for a length."""
-    leg = m.DIMENSIONS[name].leg
+    leg = ks.DIMENSIONS[name].leg
     return 1.0 if leg is None else float(geometry[leg])
 
 
@@ -115,10 +116,10 @@ def _faults(design: Design) -> Iterator[str]:
 
 def _faults_of_sizes(design: Design) -> Iterator[str]:
     for name in design.tolerance:
-        if name not in m.DIMENSIONS:
-            yield f"geometry.{name}: a tolerance is given for an unknown dimension; {nearest(name, [*m.DIMENSIONS])}"
-    sizes = {name: float(design.geometry[name]) for name in m.DIMENSIONS}
-    for name, dimension in m.DIMENSIONS.items():
+        if name not in ks.DIMENSIONS:
+            yield f"geometry.{name}: a tolerance is given for an unknown dimension; {nearest(name, [*ks.DIMENSIONS])}"
+    sizes = {name: float(design.geometry[name]) for name in ks.DIMENSIONS}
+    for name, dimension in ks.DIMENSIONS.items():
         place, size, unit = f"geometry.{name}", sizes[name], dimension.unit
         if not (math.isfinite(size) and size > 0):
             yield f"{place}: expected more than 0 {unit}, found {size:g}; give the {dimension.meaning}."
@@ -152,8 +153,8 @@ def _faults_of_groups(design: Design) -> Iterator[str]:
     for k, group in enumerate(design.together):
         place = f"together[{k}]"
         for name in group.dimensions:
-            if name not in m.DIMENSIONS:
-                yield f"{place}.dimensions: '{name}' is no dimension; {nearest(name, [*m.DIMENSIONS])}"
+            if name not in ks.DIMENSIONS:
+                yield f"{place}.dimensions: '{name}' is no dimension; {nearest(name, [*ks.DIMENSIONS])}"
         if len(set(group.dimensions)) < max(2, len(group.dimensions)):
             yield f"{place}.dimensions: expected at least two different dimensions, found {list(group.dimensions)}."
         if not -1 <= group.correlation <= 1:

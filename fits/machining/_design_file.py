@@ -9,12 +9,12 @@ from typing import Any
 import jax.numpy as jnp
 import msgspec
 
-import microid as m
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError, shown
 from fits.io._read_file import MOST_TOML_BYTES, parse_toml, read_text
 from fits.io._typed import typed
 from fits.machining._design import TOLERANCE_MM, Design, Together, lever_mm
+from microid import kinetostatics as ks
 
 SCHEMA = "microid.stage/1"
 # What to multiply by, or to divide by where that is exact.
@@ -26,7 +26,7 @@ _MASS = {"kg": (1.0, 1.0), "g": (1.0, 1e3)}
 _MODULUS = {"GPa": (1.0, 1.0), "MPa": (1.0, 1e3)}
 _Units = Mapping[str, tuple[float, float]]
 
-# Key, units (the first is the one written), field of `microid.Actuation`, and meaning.
+# Key, units (the first is the one written), field of `microid.kinetostatics.Actuation`, and meaning.
 _ACTUATION: tuple[tuple[str, _Units, str, str], ...] = (
     ("piezo_stiffness", {"N/um": (1.0, 1.0), "N/m": (1.0, 1e6)}, "piezo_N_per_um", "of a piezo, small signal"),
     ("free_stroke", _STROKE, "free_stroke_um", "elongation of a piezo without a load at the highest voltage"),
@@ -60,7 +60,7 @@ class _Group(msgspec.Struct):
     correlation: float
 
 
-_Geometry = msgspec.defstruct("_Geometry", [(name, _Dimension) for name in m.DIMENSIONS])
+_Geometry = msgspec.defstruct("_Geometry", [(name, _Dimension) for name in ks.DIMENSIONS])
 _Actuation = msgspec.defstruct("_Actuation", [(key, _Quantity if units else float) for key, units, *_ in _ACTUATION])
 
 
@@ -99,7 +99,7 @@ def design_text(design: Design) -> str:
     levels = "# 0: Euler-Bernoulli leaves between rigid blocks; 1: elastic roots, shear, links."
     lines = [f'schema = "{SCHEMA}"', levels, f"level = {design.level}", "", "[geometry]"]
     platform = ""
-    for name, dimension in m.DIMENSIONS.items():
+    for name, dimension in ks.DIMENSIONS.items():
         if dimension.platform != platform:
             platform = dimension.platform
             lines.append(f"# {platform.capitalize()} platform")
@@ -130,15 +130,15 @@ def _design(table: Mapping[str, Any]) -> Design:
         raise DataError(f'schema: expected "{SCHEMA}", found {found}; give that, or another file.')
     stage = typed(table, _Stage)
     sizes, tolerance = {}, {}
-    for name, dimension in m.DIMENSIONS.items():
+    for name, dimension in ks.DIMENSIONS.items():
         written = getattr(stage.geometry, name)
         units = _ANGLE if dimension.unit == "rad" else _LENGTH
         sizes[name] = _converted(written.value, written.unit, units, f"geometry.{name}")
         if written.tolerance is not None:
             tolerance[name] = _converted(written.tolerance, written.unit, units, f"geometry.{name}")
-    geometry = m.Geometry(**{m.DIMENSIONS[name].field: jnp.asarray(size) for name, size in sizes.items()})
+    geometry = ks.Geometry(**{ks.DIMENSIONS[name].field: jnp.asarray(size) for name, size in sizes.items()})
     # A leg of no length is refused below.
-    usual = {name: TOLERANCE_MM / (lever_mm(geometry, name) or 1.0) for name in m.DIMENSIONS}
+    usual = {name: TOLERANCE_MM / (lever_mm(geometry, name) or 1.0) for name in ks.DIMENSIONS}
     moved = {}
     for key, scale, field, _ in _ACTUATION:
         number, place = getattr(stage.actuation, key), f"actuation.{key}"
@@ -152,7 +152,7 @@ def _design(table: Mapping[str, Any]) -> Design:
         level=stage.level,
         guides=stage.material.guides,
         youngs_modulus_GPa=_converted(modulus.value, modulus.unit, _MODULUS, "material.youngs_modulus"),
-        actuation=m.Actuation(**{field: jnp.asarray(value) for field, value in moved.items()}),
+        actuation=ks.Actuation(**{field: jnp.asarray(value) for field, value in moved.items()}),
         together=tuple(Together(tuple(group.dimensions), group.correlation) for group in stage.together),
     )
 

@@ -17,7 +17,7 @@ from fits.machining._tolerances import (
     from_normal,
     tolerances,
 )
-from microid import AXES, MOTIONS, Axis
+from microid.kinetostatics import AXES, MOTIONS, Axis
 
 # One compiled function serves all calls; the last piece is filled up.
 _CHUNK = 65536

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-import microid as m
 from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
 from fits.io._json import columns
@@ -19,6 +18,7 @@ from fits.io._summary import AbstractSummary
 from fits.machining._design import Design, uniform_tolerance
 from fits.machining._gains import check_axes, gain_model, gains_of_few, once_per_function, quick_jit, twin
 from fits.machining._tolerances import tolerances
+from microid import kinetostatics as ks
 
 # So short a stroke that all motions are in proportion to it, to the last digit.
 SHORT_um = 1e-6
@@ -59,7 +59,7 @@ class AxisSensitivity:
     effect, also by the input stiffness, largest first.
     """
 
-    axis: m.Axis
+    axis: ks.Axis
     output_unit: str
     gain: float
     loaded_stroke_um: float
@@ -87,9 +87,9 @@ class SensitivityReport(AbstractSummary):
     """The sensitivities of some axes by name, and the level they hold at."""
 
     level: int
-    axes: dict[m.Axis, AxisSensitivity]
+    axes: dict[ks.Axis, AxisSensitivity]
 
-    def __getitem__(self, axis: m.Axis) -> AxisSensitivity:
+    def __getitem__(self, axis: ks.Axis) -> AxisSensitivity:
         """Sensitivities of an axis by its name."""
         return self.axes[axis]
 
@@ -108,7 +108,7 @@ class SensitivityReport(AbstractSummary):
         return [[axis for name, axis in self.axes.items() if twin(name) == first] for first in firsts]
 
 
-def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> SensitivityReport:
+def sensitivities(design: Design, axes: Sequence[ks.Axis] = ks.AXES) -> SensitivityReport:
     """Differentiate the motion of a stage with respect to its dimensions, for all axes by default.
 
     The derivatives are those of the implicit motion functions (Eq. 4, with the inverse that the paper leaves out,
@@ -116,7 +116,7 @@ def sensitivities(design: Design, axes: Sequence[m.Axis] = m.AXES) -> Sensitivit
     JAX is not in double precision.
     """
     require_float64("sensitivities need")
-    chosen: Sequence[m.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
+    chosen: Sequence[ks.Axis] = (axes,) if isinstance(axes, str) else axes  # type: ignore[assignment]
     check_axes(chosen)
     return SensitivityReport(design.level, once_per_function(chosen, lambda axis: _of_axis(design, axis)))
 
@@ -129,39 +129,39 @@ class AxisDerivatives(eqx.Module):
     loaded_stroke_um: Float[Array, ""]
     stroke: Float[Array, ""]
     slopes_at_full_stroke: dict[str, Float[Array, ""]]
-    by_voltage: m.Sensitivity
+    by_voltage: ks.Sensitivity
 
 
-def derivatives_of(design: Design, axis: m.Axis, actuation: m.Actuation | None = None) -> AxisDerivatives:
+def derivatives_of(design: Design, axis: ks.Axis, actuation: ks.Actuation | None = None) -> AxisDerivatives:
     """Differentiate the motion of an axis, with the design's piezos or others."""
     return _differentiate(twin(axis), design.geometry, design.constants, actuation or design.actuation)
 
 
 @quick_jit
 def _differentiate(
-    axis: m.Axis, geometry: m.Geometry, constants: m.Constants, actuation: m.Actuation
+    axis: ks.Axis, geometry: ks.Geometry, constants: ks.Constants, actuation: ks.Actuation
 ) -> AxisDerivatives:
     piezo = (actuation.free_stroke_um, constants, actuation.piezo_N_per_um)
-    full_um = m.loaded_um(axis, geometry, *piezo)
+    full_um = ks.loaded_um(axis, geometry, *piezo)
     strokes_um = jnp.stack([jnp.full_like(full_um, SHORT_um), full_um])
-    found = jax.vmap(lambda stroke_um: m.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
+    found = jax.vmap(lambda stroke_um: ks.sensitivity(axis, geometry, stroke_um, constants))(strokes_um)
     slopes = {name: slope[0] / SHORT_um for name, slope in found.dimensions.items()}
     at_full_stroke = {name: slope[1] for name, slope in found.dimensions.items()}
-    by_voltage = m.voltage_sensitivity(axis, geometry, *piezo)
+    by_voltage = ks.voltage_sensitivity(axis, geometry, *piezo)
     return AxisDerivatives(found.piezo[0], slopes, full_um, found.output[1], at_full_stroke, by_voltage)
 
 
-def gains_at(design: Design, axis: m.Axis, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+def gains_at(design: Design, axis: ks.Axis, errors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Gain of an axis in um/um or rad/um, shape `(n,)`, with errors of the arguments of Eq. 5, shape `(n, k)`."""
-    return np.asarray(gains_of_few(gain_model(design), errors.T, (twin(axis),), m.MOTIONS[axis].dimensions)[0])
+    return np.asarray(gains_of_few(gain_model(design), errors.T, (twin(axis),), ks.MOTIONS[axis].dimensions)[0])
 
 
-def output_scale(axis: m.Axis) -> tuple[float, str]:
+def output_scale(axis: ks.Axis) -> tuple[float, str]:
     """Unit in which the output of an axis is shown, and what to multiply an output in um or rad by."""
-    return (1e6, "urad") if m.MOTIONS[axis].unit == "rad" else (1.0, "um")
+    return (1e6, "urad") if ks.MOTIONS[axis].unit == "rad" else (1.0, "um")
 
 
-def refuse_infinite(axis: m.Axis, numbers: Iterable[float]) -> None:
+def refuse_infinite(axis: ks.Axis, numbers: Iterable[float]) -> None:
     """Raise a `DataError` if a design leads to numbers that are not finite."""
     if not np.all(np.isfinite([*numbers])):
         raise DataError(
@@ -170,8 +170,8 @@ def refuse_infinite(axis: m.Axis, numbers: Iterable[float]) -> None:
         )
 
 
-def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
-    names = m.MOTIONS[axis].dimensions
+def _of_axis(design: Design, axis: ks.Axis) -> AxisSensitivity:
+    names = ks.MOTIONS[axis].dimensions
     derived = derivatives_of(design, axis)
     gain, stroke, tolerance = float(derived.gain), float(derived.stroke), tolerances(design, names)
     slopes = np.array([float(derived.slopes[name]) for name in names])
@@ -192,7 +192,7 @@ def _of_axis(design: Design, axis: m.Axis) -> AxisSensitivity:
     per_10um = [scale * float(derived.slopes_at_full_stroke[name]) * ten_um[name] for name in names]
     columns = sizes, tolerance, scale * slopes, 100 * changes, 100 * exact, shares, per_10um
     rows = zip(names, np.stack(columns, axis=1).tolist(), strict=True)
-    effects = [DimensionEffect(name, m.DIMENSIONS[name].unit, *row) for name, row in rows]
+    effects = [DimensionEffect(name, ks.DIMENSIONS[name].unit, *row) for name, row in rows]
     effects.sort(key=lambda effect: -abs(effect.relative_change_pct))
     by_voltage = dict(sorted(by_voltage.items(), key=lambda item: -abs(item[1])))
     rss_pct, worst_case_pct = 100 * math.sqrt(max(variance, 0.0)), 100 * float(np.abs(changes).sum())

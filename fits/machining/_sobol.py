@@ -11,7 +11,7 @@ from fits.io._errors import DataError
 from fits.machining._design import Design
 from fits.machining._gains import gain_model, gains_of_many, inputs_of, once_per_function, twin
 from fits.machining._tolerances import Distribution, check, check_independent, from_normal, tolerances
-from microid import AXES, Axis
+from microid.kinetostatics import AXES, Axis
 
 _FEWEST_SAMPLES, _MOST_SAMPLES = 256, 2**20
 

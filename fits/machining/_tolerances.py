@@ -10,7 +10,7 @@ from fits.io._errors import DataError
 from fits.io._jax_setup import require_float64
 from fits.machining._design import Design
 from fits.machining._gains import check_axes
-from microid import DIMENSIONS, MOTIONS, Axis
+from microid.kinetostatics import DIMENSIONS, MOTIONS, Axis
 
 Distribution = Literal["normal", "uniform", "triangular"]
 # Variance and fourth central moment for a tolerance of one; of a normal distribution it is three standard deviations.

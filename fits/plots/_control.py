@@ -15,7 +15,8 @@ from fits.io._errors import AnyPath
 from fits.io._record import Record, Reference
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save, save_all
 from fits.stats._metrics import TWO_SIDED_95
-from microid import AbstractController, ControlledRun, Preisach, Stage, loop_gain
+from microid import Preisach, Stage
+from microid.control import AbstractController, ControlledRun, loop_gain
 
 _STYLES: dict[str, dict[str, Any]] = {
     "reference": {"color": "0.75", "linewidth": 2.5},
@@ -40,9 +41,9 @@ def plot_control(
 ) -> list[Path]:
     """Draw a run, and the loop gain and sensitivity of every plant, beside the limits of a goal.
 
-    The run is from `microid.simulate_loop`, the controller and its delay in samples as they were given there; the
-    first plant is the one that was run. `run` and `margins` are written into an existing folder, in the form `png`
-    (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
+    The run is from `microid.control.simulate_loop`, the controller and its delay in samples as they were given there;
+    the first plant is the one that was run. `run` and `margins` are written into an existing folder, in the form
+    `png` (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
     time_s = np.asarray(run.time_s)
     picture, (above, error, below) = panels(WIDE_in, 5.2, 3, 1, sharex=True, height_ratios=(1.6, 1, 1))

@@ -176,7 +176,10 @@ def fingerprint(diagnosis: Diagnosis, name: str, number: int) -> tuple[Picture, 
         return picture
 
     words = f"{view.y_label.capitalize()} against {view.x_label}, before and after the extension"
-    return _drawn(f"fingerprint{number}", words, draw), view.caption
+    caption = view.caption
+    if diagnosis.causes and name and card_of(name).statistic:
+        caption += " What is part of the noise stays in both: no model takes it away."
+    return _drawn(f"fingerprint{number}", words, draw), caption
 
 
 def program(ahead: Experiment) -> Picture | None:

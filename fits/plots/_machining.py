@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-import microid as m
 from fits.io._errors import AnyPath
 from fits.io._printable import plain
 from fits.io._record import Reference
@@ -23,15 +22,18 @@ from fits.machining._design import Design, lever_mm, paper_design
 from fits.machining._idle import IdleNoise
 from fits.machining._sensitivity import AxisSensitivity, SensitivityReport, gains_at
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, figure, label, legend, save_all, verbatim
+from microid import kinetostatics as ks
 
-AXIS_SIGNS: dict[m.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
+AXIS_SIGNS: dict[ks.Axis, str] = {"alpha": r"$\alpha$", "beta": r"$\beta$", "gamma": r"$\gamma$"}
 UNIT_SIGNS = {"um": "µm", "urad": "µrad"}
 # Odd, so that the nominal dimensions are among the steps.
 _STEPS = 41
 _LINE_in = 0.125
 _SMALL_pt = 6
 _CHARACTERS = 64
-_DIMENSION = re.compile(rf"\b(?:{'|'.join({name for motion in m.MOTIONS.values() for name in motion.dimensions})})\b")
+_DIMENSION = re.compile(
+    rf"\b(?:{'|'.join({name for motion in ks.MOTIONS.values() for name in motion.dimensions})})\b"
+)
 # A thin line from a label to its curve; without `patchA` it would end at the frame of the label.
 _LEADER: dict[str, Any] = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.4, "patchA": None}
 _LEADER |= {"shrinkA": 1.5, "shrinkB": 0, "relpos": (0, 0.5)}
@@ -58,7 +60,7 @@ def plot_sensitivity(design: Design, report: SensitivityReport, folder: AnyPath,
     """
     panels = _panels(report, lambda axis: _curves(design, axis))
     paper = paper_design()
-    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in m.DIMENSIONS)
+    same = all(float(design.geometry[name]) == float(paper.geometry[name]) for name in ks.DIMENSIONS)
     same = same and design.guides == paper.guides and design.tolerance == paper.tolerance
     claims = paper_claims(design) if same else ()
     pictures = {"tornado": _tornado(panels), "machining_error": _machining_error(design, panels, claims)}
@@ -70,14 +72,14 @@ def tornado(report: SensitivityReport) -> Figure:
     return _tornado(_panels(report, lambda _: {}))
 
 
-def _panels(report: SensitivityReport, curves: Callable[[m.Axis], dict[str, NDArray[np.float64]]]) -> list[_Panel]:
+def _panels(report: SensitivityReport, curves: Callable[[ks.Axis], dict[str, NDArray[np.float64]]]) -> list[_Panel]:
     groups = report.alike()
     titles = (", ".join(AXIS_SIGNS.get(each.axis, each.axis) for each in axes) for axes in groups)
     return [_Panel(axes[0], title, curves(axes[0].axis)) for axes, title in zip(groups, titles, strict=True)]
 
 
-def _curves(design: Design, axis: m.Axis) -> dict[str, NDArray[np.float64]]:
-    names = m.MOTIONS[axis].dimensions
+def _curves(design: Design, axis: ks.Axis) -> dict[str, NDArray[np.float64]]:
+    names = ks.MOTIONS[axis].dimensions
     shares = np.linspace(-1, 1, _STEPS)
     errors = np.concatenate([np.outer(shares, row) for row in np.diag([design.tolerance[name] for name in names])])
     gains = gains_at(design, axis, errors).reshape(len(names), _STEPS)

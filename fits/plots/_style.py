@@ -17,6 +17,8 @@ from fits.io._printable import printable
 
 # One and two columns of a journal, 90 mm and 180 mm.
 NARROW_in, WIDE_in = 3.54, 7.09
+# Of a PNG.
+DOTS_PER_in = 200
 DARK, LIGHT = "0.1", "0.75"
 MEASURED: dict[str, Any] = {"color": "0.65", "linewidth": 1.5}
 MODEL: dict[str, Any] = {"color": "0.0", "linewidth": 0.5}
@@ -113,5 +115,5 @@ def save(picture: Figure, path: Path) -> Path:
     """Write a figure, whole or not at all."""
     styled(picture)
     with atomic_path(path) as unfinished:
-        picture.savefig(unfinished, dpi=200)
+        picture.savefig(unfinished, dpi=DOTS_PER_in)
     return path

@@ -18,7 +18,7 @@ from fits.sweeps._show import open_sweep, readable, summarise
 from fits.sweeps._store import about_of
 from fits.sweeps._types import DONE, FAILED
 
-_CELLS = 12
+_CELLS, _MOST_TICKS = 12, 8
 _HIGH_in = 2.6
 _FAILED = (0.8, 0.1, 0.1, 1.0)
 
@@ -82,7 +82,7 @@ def _parallel(rows: _Rows) -> Figure:
     box: dict[str, Any] = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.6}
     for k, name in enumerate(names):
         axes.axvline(k, color=DARK, linewidth=0.6)
-        ticks = np.arange(len(rows.words[name])) if name in rows.words else np.linspace(low[k], high[k], 5)
+        ticks = _ticks(columns[:, k])
         for tick in ticks if high[k] > low[k] else ticks[:1]:
             words = f"{10**tick if logs[k] else tick:.3g}"
             if name in rows.words:
@@ -95,6 +95,13 @@ def _parallel(rows: _Rows) -> Figure:
     axes.set_axis_off()
     picture.colorbar(shades, ax=axes, label=verbatim(rows.by))
     return picture
+
+
+def _ticks(found: np.ndarray) -> np.ndarray:
+    """Where few values are, these; else five evenly from the lowest to the highest."""
+    known = found[np.isfinite(found)]
+    distinct = np.unique(known)
+    return distinct if len(distinct) <= _MOST_TICKS else np.linspace(known.min(), known.max(), 5)
 
 
 def _wrapped(name: str, most: int) -> str:
@@ -125,8 +132,9 @@ def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
         legend(picture, (axes,))
     axes.set(xscale="log" if logs[0] else "linear", yscale="log" if logs[1] else "linear")
     axes.set(xlim=corners[0][[0, -1]], ylim=corners[1][[0, -1]])
+    empty = "white: no row" if (np.histogram2d(x, y, bins=edges)[0] == 0).any() else ""
     picture.colorbar(drawn, label=f"mean {verbatim(rows.by)}")
-    label(axes, verbatim(pair[0]), verbatim(pair[1]))
+    label(axes, verbatim(pair[0]), verbatim(pair[1]), empty)
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in rows.words:
             axis.set_ticks(range(len(rows.words[name])), [verbatim(word, 24) for word in rows.words[name]])

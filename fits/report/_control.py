@@ -13,7 +13,7 @@ from fits.control._make import Loop, Made
 from fits.control._tune_problem import Tuning
 from fits.io._json import strict
 from fits.io._length import length
-from microid import ControlledRun, StepMetrics, step_metrics, tracking_errors
+from microid.control import ControlledRun, StepMetrics, step_metrics, tracking_errors
 
 # Feedback that takes off less than this share is hardly worth its trouble.
 _PAYS = 0.1

@@ -9,8 +9,8 @@ from fits.diagnosis._result import KINDS, Diagnosis, Experiment
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.plots._diagnosis import fingerprint, program, residuals, shown_runs
 from fits.report import _words
-from fits.report._next_steps import next_steps, runs_read, stage_parameters
-from fits.report._page import environment
+from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
+from fits.report._page import environment, unbroken
 from fits.report._words import (
     SIGMA,
     chance,
@@ -54,30 +54,33 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
     driven = gain.feedforward_before_um, gain.feedforward_after_um
     further += _arrow("Error under feedforward, rms", *driven)
     template = _with_words().get_template("diagnosis.html")
-    return template.render(
-        diagnosis=diagnosis,
-        ahead=ahead,
-        kind=KINDS[diagnosis.verdict],
-        when=when,
-        steps=next_steps(diagnosis),
-        runs=runs_read(diagnosis.runs),
-        parameters=stage_parameters(diagnosis),
-        tiles=_tiles(diagnosis),
-        residuals=residuals(diagnosis),
-        some_aside=any((~run.fitted).any() for run in diagnosis.runs),
-        left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
-        views=[fingerprint(diagnosis, name, k) for k, name in enumerate(named)],
-        gained=_gained(diagnosis),
-        bars=_bars(diagnosis),
-        further=further,
-        bounds=bounds,
-        strong_z=THRESHOLDS.strong_z if unnamed else math.nan,
-        most_causes=THRESHOLDS.most_causes,
-        tests=tests,
-        program=program(ahead) if ahead else None,
-        ahead_facts=_facts(ahead) if ahead else (),
-        extremes=extremes,
-        weakest=max((cause.p_family for cause in causes), default=math.nan),
+    return unbroken(
+        template.render(
+            diagnosis=diagnosis,
+            ahead=ahead,
+            kind=KINDS[diagnosis.verdict],
+            when=when,
+            steps=next_steps(diagnosis),
+            runs=runs_read(diagnosis.runs),
+            partly=partly_fitted(diagnosis.runs),
+            parameters=stage_parameters(diagnosis),
+            tiles=_tiles(diagnosis),
+            residuals=residuals(diagnosis),
+            some_aside=any((~run.fitted).any() for run in diagnosis.runs),
+            left_out=len(diagnosis.runs) - len(shown_runs(diagnosis.runs)),
+            views=[fingerprint(diagnosis, name, k) for k, name in enumerate(named)],
+            gained=_gained(diagnosis),
+            bars=_bars(diagnosis),
+            further=further,
+            bounds=bounds,
+            strong_z=THRESHOLDS.strong_z if unnamed else math.nan,
+            most_causes=THRESHOLDS.most_causes,
+            tests=tests,
+            program=program(ahead) if ahead else None,
+            ahead_facts=_facts(ahead) if ahead else (),
+            extremes=extremes,
+            weakest=max((cause.p_family for cause in causes), default=math.nan),
+        )
     )
 
 
@@ -155,6 +158,8 @@ def _facts(ahead: Experiment) -> list[tuple[str, Any]]:
         pairs.append(("Duration", f"{number(float(ahead.time_s[-1] - ahead.time_s[0]))} s"))
         pairs.append(("Voltage", _span(float(ahead.voltage_V.min()), float(ahead.voltage_V.max()), "V")))
     if ahead.separates:
-        pairs.append(("Tells apart", listed(ahead.separates)))
+        pairs.append(("Tells apart" if len(ahead.separates) > 1 else "Would show", listed(ahead.separates)))
+    if len(ahead.separates) == 1:
+        return pairs
     evidence = {"Predicted separation": ahead.predicted_z, "In the records at hand": ahead.present_z}
     return pairs + [(name, f"{sigmas(z)} {SIGMA}") for name, z in evidence.items() if math.isfinite(z)]

@@ -66,6 +66,15 @@ def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
     return rows
 
 
+def partly_fitted(runs: Sequence[RunView]) -> str:
+    """What became of the part of a run that was not fitted; nothing where there is none."""
+    if not any(0 < run.fitted.mean() < 1 for run in runs if run.fitted.size):
+        return ""
+    end = "was looked at to choose among causes" if any(not run.fitted.any() for run in runs) else "was held out"
+    others = "bad samples, and those that depend on an unknown past, count for neither"
+    return f"Of a run that is fitted in part the end {end}; {others}."
+
+
 def stage_parameters(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
     """Heads and rows of a table: what was fitted of the plain stage, and beside causes of both, with intervals."""
     after = {one.name: one for one in diagnosis.extended_parameters if diagnosis.causes}

@@ -1,11 +1,11 @@
 """A diagnosis in words and numbers with sensible digits."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from fits.diagnosis._result import SMALLEST_P, Diagnosis, RunView
+from fits.diagnosis._result import SMALLEST_P, Diagnosis, FoundCause, RunView
 from fits.io import _length
 from fits.loop._result import ParameterEstimate
 from microid.effects import card_of
@@ -128,7 +128,10 @@ def whole(name: str) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """Say in a few words what is wrong."""
-    found = listed([listed([cause.name, *cause.also_consistent], "or") for cause in diagnosis.causes])
+    classes = [(cause.name, listed(cause.also_consistent, "or")) for cause in diagnosis.causes]
+    found = listed([f"{name} (or {others})" if others else name for name, others in classes])
+    if len(classes) == 1:
+        found = listed([diagnosis.causes[0].name, *diagnosis.causes[0].also_consistent], "or")
     if diagnosis.verdict == "no_effect":
         return "No hidden effect was found."
     if diagnosis.verdict == "unexplained":
@@ -164,19 +167,30 @@ def _found(diagnosis: Diagnosis) -> str:
             f"The plain stage {described} a noise floor of {noise}. Of records that hold no effect, "
             f"{percent(diagnosis.false_alarm)} are given a cause by chance."
         )
-    sentences = []
-    for cause in diagnosis.causes:
-        what = "noise" if card_of(cause.name).statistic else "reproducible misfit of the plain stage"
-        sentences.append(
-            # No verb follows a name, as some are plural.
-            f"{percent(cause.share_of_misfit)} of the {what} is explained by {plain(cause.name)} "
-            f"({sigmas(cause.z)} standard deviations; probability by chance {chance(cause.p_family)})."
-        )
+    shares = "; ".join(_shares(diagnosis.causes))
+    sentences = [f"{shares[:1].upper()}{shares[1:]}."]
     if diagnosis.unexplained_rms_um > 0:
         sentences.append(
             f"Beyond the noise, a reproducible error of {left}, root mean square, is left without an explanation."
         )
     return " ".join(sentences)
+
+
+def _shares(causes: Sequence[FoundCause]) -> Iterator[str]:
+    """What is explained by which cause, of the misfit and of the noise."""
+    for what in ("misfit", "noise"):
+        some = [cause for cause in causes if whole(cause.name) == what]
+        parts = [
+            # No verb follows a name, as some are plural.
+            f"{percent(one.share_of_misfit)} is explained by {plain(one.name)} ({sigmas(one.z)} standard deviations, "
+            f"probability by chance {chance(one.p_family)})"
+            for one in some
+        ]
+        # What goes without saying again.
+        parts[1:] = [part.replace(" is explained", "").replace(" standard deviations", "") for part in parts[1:]]
+        if parts:
+            of = "reproducible misfit of the plain stage" if what == "misfit" else "noise"
+            yield f"of the {of} {listed(parts)}"
 
 
 def _gained(diagnosis: Diagnosis) -> list[str]:

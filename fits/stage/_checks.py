@@ -13,7 +13,7 @@ from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.stage._run import named_parts, residual_of, simulate_stage
 from fits.stage._solve import Solved, marginal_information
-from fits.stats._noise import correlation_samples
+from fits.stats._noise import correlation_samples, learn_noise
 from microid import Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig.
@@ -26,6 +26,8 @@ _HIGHEST_RESONANCE = 0.45
 UNSEEN = 0.5
 # Twice the logarithm of a likelihood ratio that noise rarely pretends.
 _CHANCE = 40.0
+# Samples over which neighbouring residuals agree where something slow is left, such as hysteresis of a linear stage.
+_SLOW = 10.0
 # Poles that piezo stages have, from slow macro stages and weak amplifiers to small ones with strong ones.
 _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.0)}
 # Remedies.
@@ -198,7 +200,12 @@ def _shows_mode(solved: Solved, name: str) -> bool:
         done_um = simulate_stage(stage, run) - simulate_stage(stage.without(name), run)
         instead = replace(run, record=replace(run.record, displacement_um=run.displacement_um + done_um))
         left, without = (residual_of(stage, one)[run.fitted] for one in (run, instead))
-        drops.append(float(without @ without - left @ left) / (noise_um**2 * correlation))
+        size = noise_um**2 * correlation
+        if correlation > _SLOW:
+            # What changes slowly hides what a mode does at its frequency, but not beside what each sample brings.
+            noise = learn_noise(left - left.mean(), 0.0)
+            left, without, size = noise.whiten(left), noise.whiten(without), 1.0
+        drops.append(float(without @ without - left @ left) / size)
     return max(drops) >= _CHANCE
 
 

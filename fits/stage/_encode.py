@@ -63,9 +63,10 @@ def decode(item: Any, where: str, spec: ParameterSpec | None = None) -> Any:
 
 def _classes() -> dict[str, type[eqx.Module]]:
     """Find the classes that a file may name: nothing else is ever called."""
-    public = (getattr(microid, name) for name in dir(microid) if not name.startswith("_"))
+    homes = microid, microid.control, microid.densities, microid.effects, microid.hysteresis, microid.kinetostatics
+    public = (getattr(home, name) for home in homes for name in dir(home) if name[0] != "_")
     models = (one for one in public if inspect.isclass(one) and issubclass(one, eqx.Module))
-    plugins = (*microid.EFFECTS, *microid.FAMILIES.values(), *microid.hysteresis.LAWS.values())
+    plugins = (*microid.effects.EFFECTS, *microid.densities.FAMILIES.values(), *microid.hysteresis.LAWS.values())
     known: list[Any] = [one for one in models if not inspect.isabstract(one)]
     return {one.__name__: one for one in (*known, *plugins, Grid, StageUncertainty, Uncertainty)}
 

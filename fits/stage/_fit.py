@@ -43,7 +43,7 @@ def default_stage(hold: m.Hold = "first") -> m.Stage:
     `first` for lines, `smooth` for curves, `zero` for steps that each begin at a sample and are not seen by it yet.
     """
     flat = m.Preisach(
-        m.GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
+        m.densities.GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
         m.Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
         jnp.asarray(0.0),
     )

@@ -20,7 +20,8 @@ from fits.stage._fit import completed, default_stage, summarise
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, solve_chain
 from fits.stage._uncertainty import Precision
-from microid import EFFECTS, AbstractEffect, AbstractPart, Stage
+from microid import AbstractPart, Stage
+from microid.effects import EFFECTS, AbstractEffect
 
 # Relaxations begin so many intervals long, and end at such a part of the longest run.
 _SHORTEST, _LONGEST = 20.0, 1 / 4

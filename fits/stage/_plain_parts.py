@@ -64,7 +64,7 @@ class PlainLinear:
 
 @dataclass(frozen=True)
 class PlainEffect:
-    """An effect of `microid.EFFECTS` by the name of its class, and its fields, its history zero."""
+    """An effect of `microid.effects.EFFECTS` by the name of its class, and its fields, its history zero."""
 
     kind: str
     values: Mapping[str, Any]

@@ -47,7 +47,7 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
         time = samples.time_s - samples.time_s.ravel()[0]
         if samples.time_s.ndim == 0:
             time = samples.time_s * jnp.arange(samples.voltage_V.shape[0], dtype=time.dtype)
-        relaxing = [p for p in behind if isinstance(p, m.AbstractEffect) and p.relaxation]
+        relaxing = [p for p in behind if isinstance(p, m.effects.AbstractEffect) and p.relaxation]
         late = [jnp.exp(-time / getattr(part, part.relaxation)) for part in relaxing]
         offset = jnp.concatenate([offset, *(one[:: samples.stride, None] for one in late)], axis=1)
     system = joined(behind)
@@ -115,7 +115,7 @@ def hysteresis_of(stage: m.Stage) -> Any:
 def free_grid(stage: m.Stage) -> tuple[str, m.Preisach] | None:
     """Name and Preisach operator of a stage that is fitted on a grid; None where it is frozen, or of another kind."""
     law, name = hysteresis_of(stage), stage.names[place_of_hysteresis(stage) or 0]
-    on_grid = isinstance(law, m.Preisach) and isinstance(law.density, m.GridDensity)
+    on_grid = isinstance(law, m.Preisach) and isinstance(law.density, m.densities.GridDensity)
     return (name, law) if on_grid and name not in stage.frozen else None
 
 
@@ -219,7 +219,7 @@ def prepare_program(stage: m.Stage, record: Record, initial: str) -> tuple[m.Sta
     """
     range_V = range_of(stage)
     refuse_outside(record, *range_V)
-    needed = {name for part in stage.parts if isinstance(part, m.AbstractEffect) for name in part.needs}
+    needed = {name for part in stage.parts if isinstance(part, m.effects.AbstractEffect) for name in part.needs}
     # What nothing depends on would only make another program of the same.
     program = replace(record, displacement_um=None, extra=record.extra if needed else {})
     needed -= {name for name, column in COLUMNS.items() if column.optional}

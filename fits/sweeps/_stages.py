@@ -169,8 +169,8 @@ def nominal_stage() -> m.Stage:
     """A stage of common size: 0 to 120 V, 17 um, loops of some 15 %, 1 ms, 200 Hz and a damping ratio of 0.03."""
     lower, upper = jnp.asarray(0.0), jnp.asarray(120.0)
     i, j = np.tril_indices(_LEVELS)
-    density = np.exp(-(i - j) / (_LEVELS - 1) / _DENSITY_WIDTH) * m.node_areas(_LEVELS)[i, j]
-    grid = m.GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
+    density = np.exp(-(i - j) / (_LEVELS - 1) / _DENSITY_WIDTH) * m.densities.node_areas(_LEVELS)[i, j]
+    grid = m.densities.GridDensity(jnp.asarray(_LOOPS_um * density / density.sum()), lower, upper)
     slope = m.Reversible(jnp.full(_LEVELS, _SLOPE_um_per_V), lower, upper)
     return m.Stage.of(
         driver=m.Driver(jnp.asarray(1e-3)),

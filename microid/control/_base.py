@@ -216,8 +216,8 @@ class AbstractLinearController(AbstractController):
         """State in which what nothing is ever added to is zero: it is a constant, and no pole of the loop."""
 
 
-# By the name of the file, with dashes.
 CONTROLLERS: dict[str, type[AbstractController]] = {}
+"""Every controller, by the name of its file, with dashes, as on the command line."""
 _Controller = TypeVar("_Controller", bound=type[AbstractController])
 
 

@@ -4,8 +4,18 @@ Importing the package imports every sibling whose name does not start with an un
 """
 
 from microid._plugins import plugins as _plugins
-from microid.densities._base import FAMILIES as FAMILIES
-from microid.densities._base import AbstractDensity as AbstractDensity
-from microid.densities._base import register as register
+from microid.densities._base import FAMILIES, AbstractDensity, node_areas, register
+from microid.densities.grid import GridDensity
+from microid.densities.mixture import MixtureDensity
+from microid.densities.network import NetworkDensity
+
+# fmt: off
+__all__ = [  # noqa: RUF022
+    # Families
+    "FAMILIES", "GridDensity", "MixtureDensity", "NetworkDensity",
+    # What a family is made of
+    "AbstractDensity", "node_areas", "register",
+]
+# fmt: on
 
 _plugins(__name__, __path__)

@@ -116,6 +116,7 @@ def node_areas(levels: int) -> np.ndarray:
 
 
 FAMILIES: dict[str, type[AbstractDensity]] = {}
+"""Every family of densities, by its name."""
 
 
 def register(cls: type[AbstractDensity]) -> type[AbstractDensity]:

@@ -4,16 +4,27 @@ Importing the package imports every sibling whose name does not start with an un
 """
 
 from microid._plugins import plugins as _plugins
-from microid.effects._base import EFFECTS as EFFECTS
-from microid.effects._base import PLACES as PLACES
-from microid.effects._base import AbstractEffect as AbstractEffect
-from microid.effects._base import Place as Place
-from microid.effects._base import Scales as Scales
-from microid.effects._base import Statistic as Statistic
-from microid.effects._base import View as View
-from microid.effects._base import card_of as card_of
-from microid.effects._base import extend as extend
-from microid.effects._base import host as host
-from microid.effects._base import register as register
+from microid.effects._base import (
+    EFFECTS,
+    PLACES,
+    AbstractEffect,
+    Place,
+    Scales,
+    Statistic,
+    View,
+    card_of,
+    extend,
+    host,
+    register,
+)
+
+# fmt: off
+__all__ = [  # noqa: RUF022
+    # Effects, and a stage that has some
+    "AbstractEffect", "EFFECTS", "extend", "host",
+    # What is known of an effect
+    "PLACES", "Place", "Scales", "Statistic", "View", "card_of", "register",
+]
+# fmt: on
 
 _plugins(__name__, __path__)

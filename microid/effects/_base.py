@@ -14,14 +14,15 @@ from microid._plant import Driver, Mechanics
 from microid._stage import Stage
 
 Place = Literal["driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise"]
-# In the order of the signal.
+"""Where an effect acts: ahead of, in or behind a part of the stage, on the time stamps, or on the noise."""
 PLACES: tuple[Place, ...] = ("driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise")
-# What a residual is drawn against: the last is the time since the voltage last started, stopped or turned.
+"""All places, in the order of the signal."""
 View = Literal["voltage", "position", "velocity", "frequency", "time", "since_move"]
+"""What a residual is drawn against: the last is the time since the voltage last started, stopped or turned."""
 # What would tell faults of the clocks apart, in the words of a report.
 _TIME_STAMPS = "raw time stamps of both clocks, which show a lost sample or a wrong rate at once."
-# What is measured of single samples and of the noise.
 Statistic = Literal["", "spikes", "rounding", "jitter", "band"]
+"""What is measured of single samples and of the noise to find an effect; empty for one that moves the stage."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +189,8 @@ class AbstractEffect(AbstractPart):
         """Pass a signal on; `start` is the `Scene` of the record."""
 
 
-# Every form of every effect, in the order of the files.
 EFFECTS: list[type[AbstractEffect]] = []
+"""Every form of every effect, in the order of the files."""
 
 _Effect = TypeVar("_Effect", bound=type[AbstractEffect])
 

@@ -7,12 +7,20 @@ start with an underscore; each registers itself.
 """
 
 from microid._plugins import plugins as _plugins
-from microid.hysteresis._base import LAWS as LAWS
-from microid.hysteresis._base import register as register
-from microid.hysteresis.bouc_wen import BoucWen as BoucWen
-from microid.hysteresis.dahl import Dahl as Dahl
-from microid.hysteresis.duhem import Duhem as Duhem
-from microid.hysteresis.maxwell_slip import MaxwellSlip as MaxwellSlip
-from microid.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
+from microid.hysteresis._base import LAWS, register
+from microid.hysteresis.bouc_wen import BoucWen
+from microid.hysteresis.dahl import Dahl
+from microid.hysteresis.duhem import Duhem
+from microid.hysteresis.maxwell_slip import MaxwellSlip
+from microid.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+
+# fmt: off
+__all__ = [  # noqa: RUF022
+    # Laws
+    "BoucWen", "Dahl", "Duhem", "LAWS", "MaxwellSlip", "PrandtlIshlinskii",
+    # For a new one
+    "register",
+]
+# fmt: on
 
 _plugins(__name__, __path__)

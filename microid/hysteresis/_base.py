@@ -5,6 +5,7 @@ from typing import TypeVar
 from microid._part import AbstractHysteresis
 
 LAWS: dict[str, type[AbstractHysteresis]] = {}
+"""Every law of hysteresis beside `Preisach`, by the name of its file."""
 _Law = TypeVar("_Law", bound=type[AbstractHysteresis])
 
 

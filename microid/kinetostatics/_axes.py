@@ -16,8 +16,11 @@ from microid.kinetostatics._compliance import Constants
 from microid.kinetostatics._geometry import DIMENSIONS, Geometry, Scalar
 
 Axis = Literal["x", "y", "z", "alpha", "beta", "gamma"]
+"""A motion of the stage: along x, y or z, in um, or about them, in rad."""
 Form = Literal["linear", "pseudo_rigid", "beam"]
+"""The form of a motion function: of first order in the stroke, or one of two for large strokes."""
 AXES: tuple[Axis, ...] = ("x", "y", "z", "alpha", "beta", "gamma")
+"""All motions, in the order of the paper."""
 _TRANSLATION = ("l1", "t1", "la1", "l2", "t2", "l3", "alpha1")
 _TILT = ("l", "l5", "la2", "alpha2", "t4")
 
@@ -73,6 +76,7 @@ MOTIONS: dict[Axis, Motion] = {
         {"linear": small.f_gamma, "beam": large.beam_gamma},
     ),
 }
+"""What each motion takes: its dimensions, its unit, um or rad, and its functions by form."""
 
 
 class Sensitivity(eqx.Module):

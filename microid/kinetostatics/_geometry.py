@@ -118,3 +118,4 @@ def _dimensions() -> dict[str, Dimension]:
 
 
 DIMENSIONS = _dimensions()
+"""Every dimension of the stage, by the paper's name of it, with its unit, mm or rad, and its field in `Geometry`."""

@@ -41,6 +41,7 @@ from fits.sweeps._types import (
     number,
     one_of,
 )
+from microid import control as ctl
 
 KEYS = ("model", "initial", "reference", "controller")
 _OUTPUTS = (
@@ -61,7 +62,7 @@ _STEP = (
     Output("settling_time_s", "s", "from the step until the displacement stays within 2 %; inf if it does not"),
     Output("overshoot_pct", "%", "beyond the final value, of the way; of the target where it has not settled"),
 )
-_LIMITS = (m.Setting("lower_V", "V", varies=False), m.Setting("upper_V", "V", varies=False))
+_LIMITS = (ctl.Setting("lower_V", "V", varies=False), ctl.Setting("upper_V", "V", varies=False))
 
 
 class Controllers(eqx.Module):
@@ -72,24 +73,24 @@ class Controllers(eqx.Module):
     found by it. Readings are late by `delay` samples.
     """
 
-    kind: type[m.AbstractController] = eqx.field(static=True)
+    kind: type[ctl.AbstractController] = eqx.field(static=True)
     numbers: dict[str, Float[Array, ""]]
     interval_s: Float[Array, ""]
-    plant: m.ControlledPlant | None
+    plant: ctl.ControlledPlant | None
     delay: int = eqx.field(static=True)
 
-    def at(self, values: Mapping[str, Float[Array, ""]]) -> m.AbstractController:
+    def at(self, values: Mapping[str, Float[Array, ""]]) -> ctl.AbstractController:
         """The controller of a row, whose values come by the names of the sweep."""
         names = [setting.name for setting in self.kind.settings if setting.varies]
         varied = {name: values[f"controller.{name}"] for name in names if f"controller.{name}" in values}
         numbers: dict[str, Any] = dict.fromkeys(GAINS, 0.0) | self.numbers | varied
         fields = {name: numbers.pop(name) for name in (*PID_SETTINGS, "lower_V", "upper_V") if name in numbers}
-        return self.kind.of(m.PID(interval_s=self.interval_s, **fields), numbers, self.plant)
+        return self.kind.of(ctl.PID(interval_s=self.interval_s, **fields), numbers, self.plant)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """What may vary, with its nominal value."""
         nominal, found = self.at({}), []
-        for setting in m.settings_of(self.kind):
+        for setting in ctl.settings_of(self.kind):
             if setting.varies:
                 name = setting.name
                 value = float(np.ravel(self.numbers[name] if name in self.numbers else getattr(nominal, name))[0])
@@ -97,20 +98,20 @@ class Controllers(eqx.Module):
         return tuple(found)
 
 
-def _parameter(setting: m.Setting, nominal: float, interval_s: float) -> Parameter:
+def _parameter(setting: ctl.Setting, nominal: float, interval_s: float) -> Parameter:
     name, upper = f"controller.{setting.name}", setting.upper / interval_s if setting.of_rate else setting.upper
     return Parameter(name, setting.unit, nominal, setting.lower, upper, whole=setting.whole)
 
 
 def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, reference: Program) -> Controllers:
     """Read the table `[controller]` of a sweep, for the nominal stage, its memory, and what it is to follow."""
-    name = one_of(m.CONTROLLERS, given.get("kind", "pid"), "controller.kind")
-    kind = m.CONTROLLERS[name]
-    settings = {setting.name: setting for setting in (*m.settings_of(kind), *_LIMITS)}
+    name = one_of(ctl.CONTROLLERS, given.get("kind", "pid"), "controller.kind")
+    kind = ctl.CONTROLLERS[name]
+    settings = {setting.name: setting for setting in (*ctl.settings_of(kind), *_LIMITS)}
     known = (*settings, "kind", "delay_samples")
     for key in given:
         if key not in known:
-            owners = [other for other, each in m.CONTROLLERS.items() if key in [one.name for one in each.settings]]
+            owners = [other for other, each in ctl.CONTROLLERS.items() if key in [one.name for one in each.settings]]
             of = f", which is of {' and '.join(owners)}" if owners else ""
             raise DataError(
                 f"controller.{key}: expected a known key of {name}, found {shown(key)}{of}; {nearest(key, known)}"
@@ -130,7 +131,7 @@ def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, ref
         kind,
         {each: jnp.asarray(value) for each, value in numbers.items()},
         jnp.asarray(reference.interval_s),
-        m.ControlledPlant(stage, slope_array(stage), delay) if left else None,
+        ctl.ControlledPlant(stage, slope_array(stage), delay) if left else None,
         delay,
     )
     try:
@@ -143,7 +144,7 @@ def read_controllers(given: Mapping[str, Any], stage: m.Stage, initial: str, ref
     return found
 
 
-def _check(numbers: Mapping[str, float], settings: Mapping[str, m.Setting], interval_s: float) -> None:
+def _check(numbers: Mapping[str, float], settings: Mapping[str, ctl.Setting], interval_s: float) -> None:
     """Refuse what is out of its bounds, whether it varies or not."""
     for each, value in numbers.items():
         place, setting = f"controller.{each}", settings[each]
@@ -161,12 +162,12 @@ def _check(numbers: Mapping[str, float], settings: Mapping[str, m.Setting], inte
             )
 
 
-def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
+def _task(stage: m.Stage, initial: str, reference: Program) -> ctl.ControlTask:
     """What the controllers are made for, as `microid control` has it, with the nominal stage and reference."""
 
     def from_rest_um() -> FloatArray:
         # A step at the first sample is none by itself, but from where the stage stands before.
-        plant = m.SampledStage(stage, reference.interval_s)
+        plant = ctl.SampledStage(stage, reference.interval_s)
         return np.append(plant.init(m.Start(None, memory_before(stage, initial)))[1], reference.wanted())
 
     def static_V() -> FloatArray:
@@ -181,7 +182,7 @@ def _task(stage: m.Stage, initial: str, reference: Program) -> m.ControlTask:
         return None if reference.shape == "step" else strongest_Hz(reference.wanted(), reference.interval_s)
 
     found = from_rest_um, static_V, lambda: steepest_slope(stage), frequency_Hz
-    return m.ControlTask(stage, reference.interval_s, *found)
+    return ctl.ControlTask(stage, reference.interval_s, *found)
 
 
 class ControlJob(eqx.Module, AbstractJob):
@@ -238,7 +239,7 @@ def _control(
 ) -> dict[str, Float[Array, " n"]]:
     def one(values: Mapping[str, Float[Array, ""]], reference: Float[Array, " t"]) -> dict[str, Float[Array, ""]]:
         controller, changed = job.controllers.at(values), varied(job.stage, values, relative)
-        run = m.simulate_loop(controller, changed, reference, delay=job.controllers.delay, start=job.start)
+        run = ctl.simulate_loop(controller, changed, reference, delay=job.controllers.delay, start=job.start)
         # A step at the first sample is none within the record, but from where the stage stood.
         way = jnp.append(reference, run.displacement_um[0])
         share = 100 / jnp.ptp(way)
@@ -252,7 +253,7 @@ def _control(
             "from_um": reference[0] - run.displacement_um[0],
         }
         if job.reference.shape == "step":
-            answer = m.step_metrics(run.time_s, run.displacement_um, reference[-1], run.displacement_um[0])
+            answer = ctl.step_metrics(run.time_s, run.displacement_um, reference[-1], run.displacement_um[0])
             waited = run.time_s[jnp.argmax(reference == reference[-1])]
             found |= {"settling_time_s": answer.settling_time_s - waited, "overshoot_pct": answer.overshoot_pct}
         return found
@@ -272,6 +273,6 @@ def _radius(
         changed = varied(job.stage, values, relative)
         slopes = [major_loop_slope(part, fine=8) for part in changed.parts if isinstance(part, m.Preisach)]
         linear, slope = job.controllers.at(values).linear(), slopes[0] if slopes else None
-        return m.margins(linear, changed, delay=job.controllers.delay, slope_um_per_V=slope).radius
+        return ctl.margins(linear, changed, delay=job.controllers.delay, slope_um_per_V=slope).radius
 
     return jax.vmap(one)(values)

@@ -26,7 +26,8 @@ from fits.stats._nonnegative import minimise_nonnegative
 from fits.sweeps._devices import by_rows, in_turn, place
 from fits.sweeps._records import Files, Holdout, Initial, Simulated, assumed_initial, each_alone, requested_records
 from fits.sweeps._types import AbstractJob, Block, Facts, FloatArray, Output, Parameter, Request, Rows, choice
-from microid import Staircase, node_areas
+from microid import Staircase
+from microid.densities import node_areas
 
 KEYS = ("model", "initial", "program", "records", "fit")
 _BLOCK, _PLACES, _FEWEST, _MOST = 32, 64, 50, 100_000

@@ -20,15 +20,19 @@ from fits.machining._design_file import read_design
 from fits.machining._sensitivity import SHORT_um
 from fits.sweeps._devices import by_rows, place
 from fits.sweeps._types import AbstractJob, Block, Facts, Output, Parameter, Request, Rows, in_a_file
+from microid import kinetostatics as ks
 
-_Tree = TypeVar("_Tree", m.Geometry, m.Actuation)
+_Tree = TypeVar("_Tree", ks.Geometry, ks.Actuation)
 KEYS = ("stage", "sensitivity")
 
 
 class _Options(msgspec.Struct):
     """The table `[sensitivity]`."""
 
-    axes: Annotated[tuple[m.Axis, ...], Meta(min_length=1, description=f"some of {', '.join(m.AXES)} in a list")] = (
+    axes: Annotated[
+        tuple[ks.Axis, ...],
+        Meta(min_length=1, description=f"some of {', '.join(ks.AXES)} in a list"),
+    ] = (
         "x",
         "z",
     )
@@ -39,14 +43,14 @@ class SensitivityJob(AbstractJob):
     """Some axes of a stage as its dimensions vary."""
 
     design: Design
-    axes: tuple[m.Axis, ...]
+    axes: tuple[ks.Axis, ...]
 
     @property
     def facts(self) -> Facts:
         """What is known before it runs."""
         outputs = []
         for axis in self.axes:
-            unit = m.MOTIONS[axis].unit
+            unit = ks.MOTIONS[axis].unit
             outputs += [
                 Output(f"{axis}_gain_{unit}_per_um", f"{unit}/um", f"{axis} per elongation of the piezo"),
                 Output(f"{axis}_stroke_{unit}", unit, f"{axis} at the highest voltage"),
@@ -54,7 +58,7 @@ class SensitivityJob(AbstractJob):
                 Output(f"{axis}_spread_pct", "%", f"root sum of squares of what the tolerances do to {axis}"),
             ]
         parameters = []
-        for name, each in m.DIMENSIONS.items():
+        for name, each in ks.DIMENSIONS.items():
             upper, size = LARGEST_ANGLE_RAD if each.unit == "rad" else math.inf, float(self.design.geometry[name])
             parameters.append(Parameter(f"geometry.{each.field}", each.unit, size, 1e-9, upper))
         for info in m.parameter_table(self.design.actuation):
@@ -72,7 +76,7 @@ class SensitivityJob(AbstractJob):
         stage, known = (design.geometry, design.actuation, material), [output.name for output in self.facts.outputs]
         found: list[np.ndarray] = []
         for axis in self.axes:
-            names = m.MOTIONS[axis].dimensions
+            names = ks.MOTIONS[axis].dimensions
             tolerance = jnp.asarray([design.tolerance[name] for name in names])
             together = jnp.asarray(design.correlation(names))
             found += _evaluate(*stage, values, tolerance, together, block.relative, axis, design.level)
@@ -94,14 +98,14 @@ def make(request: Request) -> SensitivityJob:
 
 @by_rows("values")
 def _evaluate(
-    geometry: m.Geometry,
-    actuation: m.Actuation,
+    geometry: ks.Geometry,
+    actuation: ks.Actuation,
     material: tuple[Float[Array, ""], Float[Array, ""]],
     values: Mapping[str, Float[Array, " n"]],
     tolerance: Float[Array, " d"],
     together: Float[Array, "d d"],
     relative: tuple[str, ...],
-    axis: m.Axis,
+    axis: ks.Axis,
     level: int,
 ) -> tuple[Float[Array, " n"], ...]:
     def set_in(tree: _Tree, start: str, values: Mapping[str, Array]) -> _Tree:
@@ -115,10 +119,10 @@ def _evaluate(
             nominal * values[name] if name in relative else values.get(name, nominal)
             for name, nominal in zip(("material.youngs_modulus_GPa", "material.guides"), material, strict=True)
         )
-        constants = m.constants_of(changed, level, 1e3 * modulus, guides)
-        stage = m.stage_constants(axis, changed, constants, piezos)
-        slopes = m.sensitivity(axis, changed, jnp.asarray(SHORT_um), constants).dimensions
-        dimensions = m.MOTIONS[axis].dimensions
+        constants = ks.constants_of(changed, level, 1e3 * modulus, guides)
+        stage = ks.stage_constants(axis, changed, constants, piezos)
+        slopes = ks.sensitivity(axis, changed, jnp.asarray(SHORT_um), constants).dimensions
+        dimensions = ks.MOTIONS[axis].dimensions
         changes = jnp.stack([slopes[name] for name in dimensions]) / SHORT_um * tolerance / stage.gain
         spread = 100 * jnp.sqrt(jnp.maximum(changes @ together @ changes, 0))
         return stage.gain, stage.stroke, stage.resonance_Hz, spread
