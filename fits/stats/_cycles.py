@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 # Periods in the stroke, fewest and most: what is slower is density. Bins of the stroke, and of what it is padded to.
-_FEWEST, _MOST, _BINS, _PADDED = 16, 2000, 2**15, 2**16
+_FEWEST, _MOST, _BINS, _PADDED = 8, 2000, 2**15, 2**16
 # Periods that are tried around the best of those.
 _BETWEEN = 21
 
