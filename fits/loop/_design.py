@@ -117,7 +117,7 @@ def design(
     memory = remember(voltage_V, start)
     x = jnp.clip((memory.path_V - grid.lower_V) / grid.range_V, 0, 1) * (n - 1)
     up, anchor = memory.rising[:, None], memory.anchor
-    reach = _reach(x[:, None], jnp.arange(n, dtype=x.dtype), jnp)
+    reach = _reach(x[:, None], jnp.arange(n, dtype=x.dtype)[None, :], jnp)
     # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
     high = jnp.where(up, -reach, reach[anchor])
     low = jnp.where(up, reach[anchor], reach)

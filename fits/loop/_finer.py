@@ -14,9 +14,9 @@ from fits.loop._run import Run
 # The smooth density beside plays has so many levels, and plays are half as far apart at most.
 _LEVELS, _FINER = 23, 2
 # Where the evidence for plays is looked for, see `Hyper`, and where there are none.
-_SOME, _NONE = 8.0, 20.0
-# By so many e-folds the slope may count more beside plays, and the noise be greater, where that begins.
-_MORE = (4.0, 1.0)
+_SOME, _NONE = 10.0, 20.0
+# By so many e-folds the noise is greater where that begins: a first step is along the noise, which is known best.
+_MORE = 1.0
 # In natural logarithms of the evidence, what one more unknown must be worth (Akaike).
 _WORTH = 1.0
 
@@ -39,10 +39,9 @@ def factor_with_plays(
     # As in the fit, few levels are enough to find what weighs what.
     fewer = scipy.linalg.block_diag(interpolation(EVIDENCE_LEVELS, _LEVELS), np.eye(plays.shape[1]))
     few, rough = moments.project(fewer), roughness(EVIDENCE_LEVELS).with_plays(plays.shape[1])
-    weights = [float(weight) for weight in hyper.weights]
-    start = weights[0], weights[1] + _MORE[0], *weights[2:], float(hyper.log_variance) + _MORE[1], _SOME
-    found = maximise_evidence(few, rough, Hyper.of(*start))
-    without, evidence = Hyper.of(*weights, hyper.log_variance, _NONE), Evidence(few, rough)
+    start = Hyper.of(*hyper.weights, hyper.log_variance + _MORE, _SOME)
+    without = Hyper.of(*hyper.weights, hyper.log_variance, _NONE)
+    found, evidence = maximise_evidence(few, rough, start), Evidence(few, rough)
     if not evidence.of(found) > evidence.of(without) + _WORTH:
         return None
     rough = roughness(_LEVELS).with_plays(plays.shape[1])

@@ -90,7 +90,7 @@ def fit(
             remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try 100")
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
-            tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried.solution.hyper, True)
+            tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried, True)
         from fits.loop._shapes import solve_shape  # its solver takes long to import
 
         smooth, key = tried.solution.hyper, jax.random.key(seed)

@@ -63,18 +63,20 @@ class GridSolution:
     hyper: Hyper
 
 
-def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 1.0) -> GridSolution:
+def solve_grid(
+    data: Data, stroke_um: float, start: Hyper, correlation: float = 1.0, known: bool = False
+) -> GridSolution:
     """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
 
-    One in so many samples as `correlation` is taken for an independent one. A `FitError` if the regression does not
-    converge.
+    One in so many samples as `correlation` is taken for an independent one. Where the smoothness of these records is
+    `known`, of the start only the noise is renewed on fine grids. A `FitError` if the regression does not converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), roughness(EVIDENCE_LEVELS)
-        hyper = maximise_evidence(few, even, start)
+        hyper = start if known else maximise_evidence(few, even, start)
         posterior = Posterior.of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
         determined = effective(even, hyper, Posterior.of(few, even, hyper))

@@ -6,6 +6,7 @@ traced programs, such as many fits at once, it is JAX's.
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
@@ -222,6 +223,12 @@ class Evidence:
         forms = [np.asarray(form) for form in jax.tree.leaves(rough)]
         self._forms = np.stack([form.ravel() for form in forms])
         self._diagonals = np.stack([np.diagonal(form) for form in forms])
+        # Stretches of columns that no form couples with others, but for plays, none of which it couples.
+        coupled = np.any(self._forms, axis=0).reshape(self._size, self._size)
+        last = np.maximum.accumulate([np.flatnonzero(row).max(initial=k) for k, row in enumerate(coupled)])
+        ends = np.flatnonzero(last == np.arange(self._size)) + 1
+        ends = ends[np.diff(ends, prepend=0) > 1]
+        self._parts = [slice(*ends) for ends in pairwise([0, *ends[ends < self._size], self._size])]
 
     def value(self, logs: np.ndarray) -> float:
         """The value alone."""
@@ -240,27 +247,30 @@ class Evidence:
         roots = self._roots(logs)
         return self._value(logs, *roots), self._slope(logs, *roots)
 
-    def _roots(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cholesky factors of the precision, and of the prior's alone, see `Roughness.precision`; lower ones."""
+    def _roots(self, logs: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Cholesky factors of the precision, and of parts of the prior's, see `Roughness.precision`; lower ones."""
         weights = np.exp(np.delete(logs, 4))
         prior = (weights @ self._forms).reshape(self._size, self._size)
         prior[np.diag_indices(self._size)] += 1 / 100.0**2 + _ROUNDING * np.max(weights @ self._diagonals)
-        return cholesky(self._moments.gram / np.exp(logs[4]) + prior), cholesky(prior)
+        parts = [cholesky(prior[part, part]) for part in self._parts]
+        return cholesky(self._moments.gram / np.exp(logs[4]) + prior), parts
 
-    def _value(self, logs: np.ndarray, root: np.ndarray, prior_root: np.ndarray) -> float:
+    def _value(self, logs: np.ndarray, root: np.ndarray, prior_roots: list[np.ndarray]) -> float:
         moments, variance = self._moments, np.exp(logs[4])
         half = scipy.linalg.solve_triangular(root, moments.cross_um / variance, lower=True, check_finite=False)
         misfit = moments.energy_um2 / variance - half @ half
-        volume, prior_volume = (2 * np.sum(np.log(np.diagonal(one))) for one in (root, prior_root))
+        volume, *parts = (2 * np.sum(np.log(np.diagonal(one))) for one in (root, *prior_roots))
         # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
         unlikely = np.sum(_off_middling(logs) ** 2)
-        return float(moments.count * logs[4] + misfit + volume - prior_volume + unlikely) / 2
+        return float(moments.count * logs[4] + misfit + volume - sum(parts) + unlikely) / 2
 
-    def _slope(self, logs: np.ndarray, root: np.ndarray, prior_root: np.ndarray) -> np.ndarray:
+    def _slope(self, logs: np.ndarray, root: np.ndarray, prior_roots: list[np.ndarray]) -> np.ndarray:
         moments, variance, weights = self._moments, np.exp(logs[4]), np.exp(np.delete(logs, 4))
-        covariance, alone = inverse(root), inverse(prior_root)
+        covariance = inverse(root)
         mean = covariance @ moments.cross_um / variance
-        square = covariance - alone + np.outer(mean, mean)
+        square = covariance + np.outer(mean, mean)
+        for part, prior_root in zip(self._parts, prior_roots, strict=True):
+            square[part, part] -= inverse(prior_root)
         # The floor of the precision follows its largest diagonal entry.
         floor = _ROUNDING * self._diagonals[:, np.argmax(weights @ self._diagonals)]
         out = 2 * _off_middling(logs) / _WIDTH + weights * (self._forms @ square.ravel() + floor * np.trace(square))

@@ -20,21 +20,19 @@ def minimise(
     change by less than `atol` and `rtol` of their size. By itself SciPy goes on until the slope is small, which
     rounding may keep it from. What is not finite is too far.
     """
-    before, now = start, None
+    # A first step may be small because it begins along what is known best: it ends nothing.
+    before, now = start, np.inf
 
     def end(intermediate_result: Any) -> None:
         nonlocal before, now
         x, reached = np.array(intermediate_result.x), float(intermediate_result.fun)
-        assert now is not None
         moved, gained = np.abs(x - before), abs(reached - now)
         before, now = x, reached
         if np.all(moved < atol + rtol * np.abs(x)) and gained < atol + rtol * abs(reached):
             raise StopIteration
 
     def finite(x: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal now
         value, slope = both(x)
-        now = value if now is None else now  # at the start
         return value if np.isfinite(value) else np.inf, slope
 
     options = {"maxiter": most_steps, "gtol": 0.0}
