@@ -84,10 +84,14 @@ def _resolve(
 def try_grid(
     data: Data, runs: Sequence[Run], stroke: float, before: GridTrial | None, compare: bool, alone: bool = False
 ) -> GridTrial:
-    """Fit a grid; what another one found of the smoothness `before` is kept: it is the density's, not the grid's."""
-    grid = data.grid
-    correlation, start = 1.0, Hyper.start() if before is None else before.solution.hyper
-    solution = solve_grid(data, stroke, start if before is None else before.white, known=before is not None)
+    """Fit a grid, after what another one found `before`.
+
+    The smoothness is the density's, not the grid's: of a hysteresis `alone` it is kept. Beside what is not there yet
+    it is looked for anew, from there on.
+    """
+    grid, correlation = data.grid, 1.0
+    start = Hyper.start() if before is None else before.solution.hyper
+    solution = solve_grid(data, stroke, None if alone else start, known=before.white if alone and before else None)
     white = solution.hyper
     model = grid.surface(solution.columns * stroke)
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.

@@ -64,19 +64,20 @@ class GridSolution:
 
 
 def solve_grid(
-    data: Data, stroke_um: float, start: Hyper, correlation: float = 1.0, known: bool = False
+    data: Data, stroke_um: float, start: Hyper | None, correlation: float = 1.0, known: Hyper | None = None
 ) -> GridSolution:
-    """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
+    """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on, if any.
 
-    One in so many samples as `correlation` is taken for an independent one. Where the smoothness of these records is
-    `known`, of the start only the noise is renewed on fine grids. A `FitError` if the regression does not converge.
+    One in so many samples as `correlation` is taken for an independent one. Where the smoothness is `known`, only the
+    noise is found anew, on a grid of more levels than the evidence needs. A `FitError` if the regression does not
+    converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
     rough = roughness(data.grid.levels)
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), roughness(EVIDENCE_LEVELS)
-        hyper = start if known else maximise_evidence(few, even, start)
+        hyper = known or maximise_evidence(few, even, start)
         posterior = Posterior.of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
         determined = effective(even, hyper, Posterior.of(few, even, hyper))

@@ -296,14 +296,15 @@ def inverse(root: np.ndarray) -> np.ndarray:
     return np.asarray(full)
 
 
-def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper:
-    """Find the smoothness and the noise under which the data, in strokes, are most probable."""
-    evidence = Evidence(moments, rough)
+def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper | None) -> Hyper:
+    """Find the smoothness and the noise under which the data, in strokes, are most probable, from a start if any."""
+    evidence, cold = Evidence(moments, rough), start is None
+    start = Hyper.start() if start is None else start
     first = np.array([float(log) for log in jax.tree.leaves(start)])
     # A step too far is not finite, and taken back. Out of steps on a flat evidence, the best place so far is as good
     # as any; the regression itself must converge.
     with np.errstate(all="ignore"):
-        return Hyper.of(*minimise(evidence.both, first, rtol=1e-3, atol=1e-2, most_steps=128))
+        return Hyper.of(*minimise(evidence.both, first, 1e-3, 1e-2, most_steps=128, cold=cold))
 
 
 def effective(rough: Roughness, hyper: Hyper, posterior: Posterior) -> Float[Array | np.ndarray, ""]:

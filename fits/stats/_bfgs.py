@@ -13,15 +13,16 @@ def minimise(
     rtol: float,
     atol: float,
     most_steps: int,
+    cold: bool = False,
 ) -> np.ndarray:
     """Go down from a start, shape `(k,)`, to where steps and gains are small, or as far as so many steps lead.
 
     `both` gives the value and its derivatives, `(k,)`. A step counts as small where each variable, and the value,
     change by less than `atol` and `rtol` of their size. By itself SciPy goes on until the slope is small, which
-    rounding may keep it from. What is not finite is too far.
+    rounding may keep it from. A first step from a `cold` start may be small because it is along what is known best:
+    it ends nothing. What is not finite is too far.
     """
-    # A first step may be small because it begins along what is known best: it ends nothing.
-    before, now = start, np.inf
+    before, now = start, np.inf if cold else both(start)[0]
 
     def end(intermediate_result: Any) -> None:
         nonlocal before, now
