@@ -3,11 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from microid._forest import forest_sum
 from microid._memory import Memory
+from microid._platform import _by_platform
 
 # A quadratic B-spline has three pieces; its tensor product a window of three by three coefficients.
 _WINDOW = 3
@@ -216,15 +218,52 @@ def _window_jvp(
     left, right = _basis(s), _basis(t)
     out = _contract(table, i, j, left, right)
     slope = _contract(table, i, j, _slope(s), right) * s_dot + _contract(table, i, j, left, _slope(t)) * t_dot
-    # One gather of whole windows: its transpose is one scatter, several times cheaper than nine.
+    return out, slope + _linear(table_dot, i, s, j, t)
+
+
+def _linear(table: Array, *place: Array) -> Array:
+    """The same as `_window`, as a linear function of the table, whose transpose is one pass on a CPU."""
+
+    def read(table: Array, i: Array, s: Array, j: Array, t: Array) -> Array:
+        return _contract(table, i, j, _basis(s), _basis(t))
+
+    def residual(both: tuple[Array, Array]) -> tuple[Array, Array]:
+        return both[0], both[1] - read(both[0], *place)
+
+    def solve(_: object, both: tuple[Array, Array]) -> tuple[Array, Array]:
+        return both[0], both[1] + read(both[0], *place)
+
+    def transpose_solve(_: object, both: tuple[Array, Array]) -> tuple[Array, Array]:
+        return both[0] + _by_platform(*place, *both, cpu=_gather_back, default=_scatter), both[1]
+
+    # The implicit form has a cheap transpose, as that of `forest_sum`; what is solved for must be linear, zeros too.
+    none = jnp.broadcast_to(0 * table[0], place[1].shape)
+    return lax.custom_linear_solve(residual, (table, none), solve, transpose_solve)[1]
+
+
+def _gather_back(i: Array, s: Array, j: Array, t: Array, table: Array, cotangent: Array) -> Array:
+    """Add up what reads each coefficient of a table, `(q,)`: first for each cell alone, whose nine lie together."""
+    width, none = round(table.shape[0] ** 0.5), np.int32(0)
+    cells = width - _WINDOW + 1
+
+    def visit(k: Int[Array, ""], total: Array) -> Array:
+        left, right = jnp.stack(_basis(s[k])) * cotangent[k], jnp.stack(_basis(t[k]))
+        more, at = (left[:, None] * right[None, :]).reshape(1, -1), (i[k] * cells + j[k], none)
+        return lax.dynamic_update_slice(total, lax.dynamic_slice(total, at, more.shape) + more, at)
+
+    start = jnp.zeros((cells**2, _WINDOW**2), table.dtype)
+    total = lax.fori_loop(none, np.int32(s.shape[0]), visit, start).reshape(cells, cells, -1)
+    out = jnp.zeros((width, width), table.dtype)
+    for k, (p, q) in enumerate(np.ndindex(_WINDOW, _WINDOW)):
+        out = out.at[p : p + cells, q : q + cells].add(total[:, :, k])
+    return out.ravel()
+
+
+def _scatter(i: Array, s: Array, j: Array, t: Array, table: Array, cotangent: Array) -> Array:
+    """The same for what computes many numbers at once: one scatter of windows."""
     width = round(table.shape[0] ** 0.5)
-    numbers = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
-    windows = lax.gather(
-        table_dot.reshape(width, width),
-        jnp.stack([i, j], axis=-1),
-        numbers,
-        (_WINDOW, _WINDOW),
-        mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS,
-    )
-    weight = jnp.stack([jnp.stack(right, axis=-1) * a[:, None] for a in left], axis=1)
-    return out, slope + jnp.sum(windows * weight, axis=(1, 2))
+    numbers = lax.ScatterDimensionNumbers((1, 2), (), (0, 1))
+    windows = jnp.stack([jnp.stack(_basis(t), axis=-1) * (a * cotangent)[:, None] for a in _basis(s)], axis=1)
+    mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    zeros = jnp.zeros((width, width), table.dtype)
+    return lax.scatter_add(zeros, jnp.stack([i, j], axis=-1), windows, numbers, mode=mode).ravel()

@@ -21,10 +21,14 @@ LADDER = (16, 23, 32, 45, 64, 90)
 
 @dataclass(frozen=True)
 class GridTrial:
-    """A resolution that was tried: its data, its solution, and how it predicts blocks from the others."""
+    """A resolution that was tried: its data, its solution, and how it predicts blocks from the others.
+
+    `white` is the smoothness and noise that the evidence has where all samples are taken for independent ones.
+    """
 
     data: Data
     solution: GridSolution
+    white: Hyper
     correlation: float
     error_um: float
     discrepancy_um: float
@@ -41,9 +45,10 @@ def choose_grid(
     """
     stroke = max(_stroke(run) for run in runs)
 
-    def trial(n: int, hyper: Hyper) -> GridTrial:
+    def trial(n: int, before: GridTrial | None) -> GridTrial:
         progress(f"{n} levels")
-        return try_grid(gather(grid_of(runs, n), runs, progress=progress), runs, stroke, hyper, levels is None, alone)
+        data = gather(grid_of(runs, n), runs, progress=progress)
+        return try_grid(data, runs, stroke, before, levels is None, alone)
 
     digit = max(quantum_um(run.displacement_um[run.fitted]) for run in runs)
     tried, trials = _resolve(trial, levels, finest, 1.2 * digit / 12**0.5)
@@ -51,19 +56,19 @@ def choose_grid(
 
 
 def _resolve(
-    trial: Callable[[int, Hyper], GridTrial], levels: int | None, finest: int, rounding_um: float
+    trial: Callable[[int, GridTrial | None], GridTrial], levels: int | None, finest: int, rounding_um: float
 ) -> tuple[GridTrial, list[LevelTrial]]:
     """Refine until it no longer pays; of grids that predict alike the finest is kept.
 
     What a last digit rounds off repeats itself with every loop, and a fine grid would follow it from digit to digit.
     """
-    best = trial(levels or LADDER[0], Hyper.start())
+    best = trial(levels or LADDER[0], None)
     trials = [LevelTrial(best.data.grid.levels, best.error_um)]
     for n in [n for n in LADDER[1:] if n <= finest] if levels is None else ():
         if best.error_um <= rounding_um:
             break
         try:
-            finer = trial(n, best.solution.hyper)
+            finer = trial(n, best)
         except FitError:
             # What is coarser has an answer.
             break
@@ -77,11 +82,17 @@ def _resolve(
 
 
 def try_grid(
-    data: Data, runs: Sequence[Run], stroke: float, hyper: Hyper, compare: bool, alone: bool = False
+    data: Data, runs: Sequence[Run], stroke: float, before: GridTrial | None, compare: bool, alone: bool = False
 ) -> GridTrial:
-    grid = data.grid
-    correlation = 1.0
-    solution = solve_grid(data, stroke, hyper)
+    """Fit a grid, after what another one found `before`.
+
+    The smoothness is the density's, not the grid's: of a hysteresis `alone` it is kept. Beside what is not there yet
+    it is looked for anew, from there on.
+    """
+    grid, correlation = data.grid, 1.0
+    start = Hyper.start() if before is None else before.solution.hyper
+    solution = solve_grid(data, stroke, None if alone else start, known=before.white if alone and before else None)
+    white = solution.hyper
     model = grid.surface(solution.columns * stroke)
     # Misfit and coloured noise make neighbouring residuals agree; counted as independent they would fake precision.
     off = [run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted) for run in runs]
@@ -96,7 +107,7 @@ def try_grid(
             solution = solve_coloured(data, stroke, correlation, solution.hyper, relaxation)
         else:
             # What a stage adds is not there yet, and must not become roughness of the density.
-            solution = solve_grid(data, stroke, hyper, correlation)
+            solution = solve_grid(data, stroke, start, correlation)
     n = grid.levels if compare else min(grid.levels, BELIEF_LEVELS)
     error, discrepancy = cross_validate(data, runs, stroke, correlation, solution.hyper, n)
     # What is finer than the samples looks like noise but for coming back with the voltage.
@@ -104,7 +115,7 @@ def try_grid(
         repeated_square(run.voltage_V[run.fitted], one, correlation) for run, one in zip(runs, left, strict=True)
     ]
     discrepancy = max(discrepancy, float(np.average(repeated, weights=[len(one) for one in left])) ** 0.5)
-    return GridTrial(data, solution, correlation, error, discrepancy)
+    return GridTrial(data, solution, white, correlation, error, discrepancy)
 
 
 def _stroke(run: Run) -> float:

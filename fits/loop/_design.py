@@ -1,6 +1,9 @@
 """The Preisach operator as a linear regression: one column per weight and slope."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
@@ -57,8 +60,8 @@ class Grid(eqx.Module):
         return nodes, columns_um[self.weights :] / (upper - lower)
 
     def surface(self, columns_um: np.ndarray) -> Surface:
-        """The Everett surface of a solution in um, `(D,)`."""
-        return Surface.of(*self.densities(columns_um[:, None]), *self.ends_V)
+        """The Everett surface of a solution in um, `(D,)`, or those of several, `(D, k)`."""
+        return Surface.of(*self.densities(columns_um.reshape(len(columns_um), -1)), *self.ends_V)
 
     @eqx.filter_jit
     def model(
@@ -82,6 +85,28 @@ def columns_of(model: Preisach) -> Float[Array, " D"]:
     return jnp.concatenate([weights, model.reversible.slope_um_per_V * range_V])
 
 
+@dataclass(frozen=True)
+class Columns:
+    """Columns of the regression on some levels, as `Responses` computes them.
+
+    `table` are their branch polynomials, `(4, 2 (levels - 1), D)`; those that remember come first, and `products`
+    gives what they add on a rectangle, `(p, m)`, from the integrals of hat functions along its sides, `(levels, m)`.
+    """
+
+    table: np.ndarray
+    products: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return self.table.shape[1] // 2 + 1
+
+    @property
+    def size(self) -> int:
+        """Number of columns, `D`."""
+        return self.table.shape[2]
+
+
 def design(
     grid: Grid, table: Float[Array, "4 k D"], voltage_V: Float[Array, " n"], start: Staircase
 ) -> tuple[Float[Array, "n D"], Staircase]:
@@ -93,11 +118,11 @@ def design(
     memory = remember(voltage_V, start)
     x = jnp.clip((memory.path_V - grid.lower_V) / grid.range_V, 0, 1) * (n - 1)
     up, anchor = memory.rising[:, None], memory.anchor
-    reach = _reach(x, n, jnp)
+    reach = _reach(x[:, None], jnp.arange(n, dtype=x.dtype)[None, :], jnp)
     # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
     high = jnp.where(up, -reach, reach[anchor])
     low = jnp.where(up, reach[anchor], reach)
-    total = forest_sum(_rectangles(high, low, jnp).at[0].set(0), anchor)[memory.lead :]
+    total = forest_sum(_rectangles(high, low).at[0].set(0), anchor)[memory.lead :]
 
     x, rising = x[memory.lead :], memory.rising[memory.lead :]
     cell = jnp.clip(x.astype(jnp.int32), 0, n - 2)
@@ -107,42 +132,76 @@ def design(
     return branch + jnp.pad(total, ((0, 0), (0, n))), memory.end()
 
 
-def responses(grid: Grid, table: np.ndarray, path: Path) -> np.ndarray:
-    """The same as `design` in NumPy, which compiles nothing, along a path: shape `(n, D)`."""
-    n, (lower, upper) = grid.levels, grid.ends_V
-    x = np.clip((path.values - lower) / (upper - lower), 0, 1) * (n - 1)
-    reach, up = _reach(x, n, np), path.rising[:, None]
-    before = reach[path.anchor]
-    total = path.add(_rectangles(np.where(up, -reach, before), np.where(up, before, reach), np))[path.lead :]
+class Responses:
+    """Responses along a path of every column alone, in NumPy, which compiles nothing.
 
-    x = x[path.lead :]
-    cell = np.minimum(x.astype(np.int64), n - 2)
-    powers, branch = np.vander(x - cell, 4, increasing=True), np.where(path.rising[path.lead :], cell, cell + (n - 1))
-    out = np.empty((len(x), grid.columns))
-    for one in np.unique(branch):
-        here = branch == one
-        out[here] = powers[here] @ table[:, one]
-    out[:, : grid.weights] += total
-    return out
+    Entries behind the lead are four to a group, and mixed by `mix`, `(g, 4, 4)`; of the `4 g` mixtures those are
+    meant that are in the `order`, `(m,)`. A group is a `whole` visit, one branch between two levels, or is not mixed:
+    then only the diagonal counts. What is mixed are the few numbers that all columns are made of.
+    """
+
+    def __init__(
+        self,
+        columns: Columns,
+        ends_V: tuple[float, float],
+        path: Path,
+        mix: np.ndarray,
+        whole: np.ndarray,
+        order: np.ndarray,
+    ):
+        n, (lower, upper), lead = columns.levels, ends_V, path.lead
+        nodes, scale = np.arange(float(n))[:, None], (n - 1) / (upper - lower)
+        turns, at = path.turns
+        turn = _reach((np.clip(turns.values, lower, upper) - lower) * scale, nodes, np)
+        up, before = turns.rising, turn[:, turns.anchor]
+        sides = np.where(up, -turn, before), np.where(up, before, turn)
+        remembered = turns.add(columns.products(*sides).T.copy()).T.copy()
+
+        # Of a visit the second entry says where it is: it is nowhere near the ends.
+        entry = lead + 4 * np.arange(len(mix))[:, None] + np.where(whole[:, None], 1, np.arange(4))
+        x = (np.clip(path.values, lower, upper) - lower) * scale
+        cell, x = np.minimum(x[entry].astype(np.int64), n - 2), x[lead:].reshape(-1, 1, 4)
+        powers = np.vander((x - cell[:, :, None]).ravel(), 4, increasing=True).reshape(*mix.shape, 4)
+        way = np.einsum("gab,gabk->kga", mix, powers).reshape(4, -1)[:, order]
+        reach = np.moveaxis(_reach(x, nodes, np) @ mix.swapaxes(1, 2), 1, 0).reshape(n, -1)[:, order]
+        up, anchor = (each[entry.ravel()[order]] for each in (path.rising, at))
+        before = turn[:, anchor]
+
+        self._columns, self._remembered, self._anchor = columns, remembered, anchor
+        self._way, self._branch = way, np.where(up, 0, n - 1) + cell.ravel()[order]
+        # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
+        self._sides = np.where(up, -reach, before), np.where(up, before, reach)
+
+    def of(self, which: slice) -> np.ndarray:
+        """Those of some mixtures, `(D, l)`."""
+        way, branch = self._way[:, which], self._branch[which]
+        out = np.empty((self._columns.size, len(branch)))
+        begins = np.flatnonzero(np.diff(branch, prepend=-1))
+        for first, stop in pairwise([*begins, len(branch)]):
+            out[:, first:stop] = self._columns.table[:, branch[first]].T @ way[:, first:stop]
+        total = self._remembered[:, self._anchor[which]]
+        total *= way[0]
+        total += self._columns.products(*(side[:, which] for side in self._sides))
+        out[: len(total)] += total
+        return out
 
 
-def _reach(x: Any, n: int, xp: Any) -> Any:
-    """Integral of each hat function up to `x` levels, `(m,)`, in units of the range, shape `(m, N)`; by `xp`."""
-    nodes = xp.arange(n, dtype=x.dtype)[None, :]
-    z = xp.clip(x[:, None] - nodes, -1, 1)
+def _reach(x: Any, nodes: Any, xp: Any) -> Any:
+    """Integral of the hat function of each of all nodes up to `x`, both in levels, in units of the range; by `xp`."""
+    z = xp.clip(x - nodes, -1, 1)
     rise = xp.where(z < 0, (z + 1) ** 2 / 2, 1 - (1 - z) ** 2 / 2)
     # Of the first there is only the half within the range.
-    return (rise - xp.where(nodes == 0, 0.5, 0.0)) / (n - 1)
+    return (rise - xp.where(nodes == 0, 0.5, 0.0)) / (nodes.size - 1)
 
 
-def _rectangles(high: Any, low: Any, xp: Any) -> Any:
-    """Products of the two, `(m, N)`, along all pairs `(i, j <= i)`, packed row by row, shape `(m, p)`; by `xp`.
+def _rectangles(high: Array, low: Array) -> Array:
+    """Products of the two, `(m, N)`, along all pairs `(i, j <= i)`, packed row by row, shape `(m, p)`.
 
     The nodes under the diagonal triangles continue the three corners linearly: what they would add goes to those.
     """
     n = high.shape[1]
     i, j = np.tril_indices(n)
-    ghost = xp.pad(high[:, :-1] * low[:, 1:], ((0, 0), (1, 1)))
+    ghost = jnp.pad(high[:, :-1] * low[:, 1:], ((0, 0), (1, 1)))
     # Column k + 1 holds ghost k; the first and last are zero.
     after = np.where(i == j, i + 1, 0)
     before = np.where(i == j, i, 0)
@@ -150,13 +209,30 @@ def _rectangles(high: Any, low: Any, xp: Any) -> Any:
     return high[:, i] * low[:, j] + ghost[:, after] + ghost[:, before] - ghost[:, beside]
 
 
+def rectangles(high: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """The same in NumPy, of `(N, m)`, shape `(p, m)`."""
+    n = len(high)
+    first = np.arange(n) * np.arange(1, n + 1) // 2
+    corner, out = first + np.arange(n), np.empty((n * (n + 1) // 2, high.shape[1]))
+    for i in range(n):
+        np.multiply(high[i], low[: i + 1], out=out[first[i] : first[i] + i + 1])
+    ghost = high[:-1] * low[1:]
+    out[corner[:-1]] += ghost
+    out[corner[1:]] += ghost
+    out[corner[1:] - 1] -= ghost
+    return out
+
+
 @lru_cache(maxsize=16)
 def branch_table(levels: int) -> np.ndarray:
     """Branch polynomials of every column, shape `(4, 2 (levels - 1), D)`."""
-    size = levels * (levels + 1) // 2
-    tables = []
+    size = levels * (levels + 3) // 2
     # Some at a time, as each has a window of its own.
-    for k in range(0, size + levels, 256):
-        unit = np.eye(size + levels, min(256, size + levels - k), -k)
-        tables.append(Surface.of(spread(unit[:size], levels), unit[size:], 0.0, 1.0).branch_um)
-    return np.concatenate(tables, axis=2)
+    units = (np.eye(size, min(256, size - k), -k) for k in range(0, size, 256))
+    return np.concatenate([branches_of(unit, levels) for unit in units], axis=2)
+
+
+def branches_of(columns: np.ndarray, levels: int) -> np.ndarray:
+    """Branch polynomials of combinations of columns, `(D, k)`, shape `(4, 2 (levels - 1), k)`."""
+    density, slope = np.split(columns, [levels * (levels + 1) // 2])
+    return Surface.of(spread(density, levels), slope, 0.0, 1.0).branch_um

@@ -5,52 +5,55 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from fits.loop._design import Grid
-from fits.loop._grid import BELIEF_LEVELS, EVIDENCE_LEVELS, GridSolution, non_negative
-from fits.loop._moments import Data, gather, grid_of
+from fits.loop._design import Columns, Grid, branches_of
+from fits.loop._grid import EVIDENCE_LEVELS, non_negative
+from fits.loop._moments import gather, grid_of
 from fits.loop._prior import Evidence, Hyper, Posterior, cholesky, interpolation, maximise_evidence, roughness
 from fits.loop._run import Run
 
-# Plays are as close together as so many levels at least.
-_LEVELS = 45
+# The smooth density beside plays has so many levels, and plays are half as far apart at most.
+_LEVELS, _FINER = 23, 2
 # Where the evidence for plays is looked for, see `Hyper`, and where there are none.
-_SOME, _NONE = 8.0, 20.0
-# By so many e-folds the slope may count more beside plays, and the noise be greater, where that begins.
-_MORE = (4.0, 1.0)
+_SOME, _NONE = 10.0, 20.0
+# By so many e-folds the noise is greater where that begins: a first step is along the noise, which is known best.
+_MORE = 1.0
 # In natural logarithms of the evidence, what one more unknown must be worth (Akaike).
 _WORTH = 1.0
 
 
 def factor_with_plays(
-    data: Data, runs: Sequence[Run], solution: GridSolution, stroke_um: float
+    levels: int, runs: Sequence[Run], hyper: Hyper, stroke_um: float
 ) -> tuple[Grid, np.ndarray, np.ndarray] | None:
     """Factor of the covariance of a grid's columns beside plays, in um, `(D, k)`, and its mean response, `(k,)`.
 
     A sum of few plays is a density of sharp ridges along the diagonal, which no smooth one follows. Here each width
-    has a play of its own. None where the records, whose noise is white, are not more probable with them.
+    has a play of its own, about as many as a fit had `levels`, and 45 at least; `hyper` is what that fit found. None
+    where the records, whose noise is white, are not more probable with them.
     """
-    fine = data if data.grid.levels >= _LEVELS else gather(grid_of(runs, _LEVELS), runs)
-    levels, hyper = fine.grid.levels, solution.hyper
-    plays = play_columns(levels)
-    basis = np.concatenate([interpolation(BELIEF_LEVELS, levels), plays], axis=1)
-    moments = fine.total.scaled(1.0, stroke_um).project(basis)
+    finer = max(_FINER, round((levels - 1) / (_LEVELS - 1)))
+    levels = finer * (_LEVELS - 1) + 1
+    # The levels of the smooth density are among those of the plays: on these it is exactly what it is on its own.
+    grid, plays = grid_of(runs, levels), play_columns(levels)
+    data = gather(grid_of(runs, _LEVELS), runs, 1, beside=Columns(branches_of(plays, levels), ridges))
+    moments = data.total.scaled(1.0, stroke_um)
     # As in the fit, few levels are enough to find what weighs what.
-    fewer = scipy.linalg.block_diag(interpolation(EVIDENCE_LEVELS, BELIEF_LEVELS), np.eye(plays.shape[1]))
+    fewer = scipy.linalg.block_diag(interpolation(EVIDENCE_LEVELS, _LEVELS), np.eye(plays.shape[1]))
     few, rough = moments.project(fewer), roughness(EVIDENCE_LEVELS).with_plays(plays.shape[1])
-    weights = [float(weight) for weight in hyper.weights]
-    start = weights[0], weights[1] + _MORE[0], *weights[2:], float(hyper.log_variance) + _MORE[1], _SOME
-    found = maximise_evidence(few, rough, Hyper.of(*start))
-    without, evidence = Hyper.of(*weights, hyper.log_variance, _NONE), Evidence(few, rough)
+    start = Hyper.of(*hyper.weights, hyper.log_variance + _MORE, _SOME)
+    without = Hyper.of(*hyper.weights, hyper.log_variance, _NONE)
+    found, evidence = maximise_evidence(few, rough, start), Evidence(few, rough)
     if not evidence.of(found) > evidence.of(without) + _WORTH:
         return None
-    rough = roughness(BELIEF_LEVELS).with_plays(plays.shape[1])
+    rough = roughness(_LEVELS).with_plays(plays.shape[1])
     posterior, alone = (Posterior.of(moments, rough, one) for one in (found, without))
     factor = bounded_factor(posterior)
     if factor is None:
         return None
     # The fit is one without plays: it may be off by what they change.
-    factor = stroke_um * basis @ np.concatenate([factor, (posterior.mean - alone.mean)[:, None]], axis=1)
-    return fine.grid, factor, fine.means[0].response @ factor
+    factor = stroke_um * np.concatenate([factor, (posterior.mean - alone.mean)[:, None]], axis=1)
+    smooth = len(factor) - plays.shape[1]
+    columns = interpolation(_LEVELS, levels) @ factor[:smooth] + plays @ factor[smooth:]
+    return grid, columns, data.means[0].response @ factor
 
 
 def bounded_factor(posterior: Posterior) -> np.ndarray | None:
@@ -72,3 +75,12 @@ def play_columns(levels: int) -> np.ndarray:
     plays = np.zeros((len(i) + levels, levels))
     plays[np.arange(len(i)), i - j] = levels - 1
     return plays[:, 1:-1]
+
+
+def ridges(high: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """What plays add on a rectangle, `(levels - 2, m)`; see `Columns`."""
+    n = len(high)
+    out = np.stack([np.einsum("im,im->m", high[k:], low[: n - k]) for k in range(1, n - 1)])
+    # What the nodes under the diagonal triangles take off beside the diagonal, see `rectangles`.
+    out[0] -= np.einsum("im,im->m", high[:-1], low[1:])
+    return (n - 1) * out

@@ -93,7 +93,7 @@ def fit(
             remarks.append(f"refining still helped at {LADDER[-1]} levels, the finest tried: try 100")
     else:
         if levels is None and tried.data.grid.levels < _SHAPE_LEVELS:
-            tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried.solution.hyper, True)
+            tried = try_grid(gather(grid_of(runs, _SHAPE_LEVELS), runs), runs, stroke, tried, True)
         from fits.loop._shapes import solve_shape  # its solver takes long to import
 
         smooth, key = tried.solution.hyper, jax.random.key(seed)
@@ -113,7 +113,7 @@ def fit(
     believed = tried.data.grid, found.factor_um, mean.response @ found.factor_um
     if family == "grid" and found.correlation <= WHITE:  # elsewhere blocks say how smooth it is, not the evidence
         progress("looking for plays between the levels")
-        believed = factor_with_plays(tried.data, runs, tried.solution, stroke) or believed
+        believed = factor_with_plays(tried.data.grid.levels, runs, tried.solution.hyper, stroke) or believed
     progress("checking the records")
     miss, told = check_loops(runs, prepare, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]

@@ -9,19 +9,21 @@ import jax
 import numpy as np
 import scipy
 
-from fits.loop._moments import Data, Moments, blocks_of
+from fits.loop._moments import Data, blocks_of
 from fits.loop._prior import (
     Hyper,
     Posterior,
     cholesky,
     effective,
     interpolation,
+    inverse,
     maximise_evidence,
     renew_noise,
     roughness,
 )
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Run, simulate_run
+from fits.loop._run import Run
+from fits.loop._surface import Surface
 from fits.stats._noise import shared_square
 from fits.stats._nonnegative import pivot_nonnegative
 from microid import Preisach
@@ -61,10 +63,13 @@ class GridSolution:
     hyper: Hyper
 
 
-def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 1.0) -> GridSolution:
-    """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on.
+def solve_grid(
+    data: Data, stroke_um: float, start: Hyper | None, correlation: float = 1.0, known: Hyper | None = None
+) -> GridSolution:
+    """Find the most probable non-negative columns, smoothness and noise, all in strokes, from a `start` on, if any.
 
-    One in so many samples as `correlation` is taken for an independent one. A `FitError` if the regression does not
+    One in so many samples as `correlation` is taken for an independent one. Where the smoothness is `known`, only the
+    noise is found anew, on a grid of more levels than the evidence needs. A `FitError` if the regression does not
     converge.
     """
     moments = data.total.scaled(1 / correlation, stroke_um)
@@ -72,7 +77,7 @@ def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 
     if data.grid.levels > EVIDENCE_LEVELS:
         basis = interpolation(EVIDENCE_LEVELS, data.grid.levels)
         few, even = moments.project(basis), roughness(EVIDENCE_LEVELS)
-        hyper = maximise_evidence(few, even, start)
+        hyper = known or maximise_evidence(few, even, start)
         posterior = Posterior.of(moments, rough, hyper)
         # What the coarse levels could not follow was noise to them.
         determined = effective(even, hyper, Posterior.of(few, even, hyper))
@@ -86,8 +91,6 @@ def solve_grid(data: Data, stroke_um: float, start: Hyper, correlation: float = 
 
 
 def _bounded(posterior: Posterior, hyper: Hyper) -> GridSolution:
-    if np.all(posterior.mean >= 0):
-        return GridSolution(np.asarray(posterior.mean), posterior, hyper)
     columns, found = non_negative(posterior)
     if not found:
         raise FitError(FitStatus.MAX_STEPS)
@@ -145,6 +148,8 @@ def non_negative(posterior: Posterior) -> tuple[np.ndarray, bool]:
     those ends up below zero, more are bounded. The answer is that of all bounds together.
     """
     posterior = jax.tree.map(np.asarray, posterior)
+    if np.all(posterior.mean >= 0):
+        return np.asarray(posterior.mean), True
     scale = np.sqrt(np.diagonal(posterior.precision))
     lowest = posterior.mean * scale
     if not np.all(np.isfinite(lowest)):  # rounding left no Cholesky factor
@@ -236,27 +241,37 @@ def cross_validate(
         basis = interpolation(levels, data.grid.levels)
         rough, blocks = roughness(levels), tuple(block.project(basis) for block in blocks)
     whole = reduce(operator.add, blocks)
-    labels = [blocks_of(run, data.pieces) for run in runs]
-    squares = shared = expected = count = 0.0
-    for number, block in enumerate(blocks):
-        if not block.count > 0:
-            continue
-        posterior = Posterior.of((whole - block).scaled(1 / correlation, stroke_um), rough, hyper)
-        columns = non_negative(posterior)[0]
-        model = data.grid.surface((columns if basis is None else basis @ columns) * stroke_um)
-        # A short run may have no sample in a block.
-        off = []
-        for run, label in zip(runs, labels, strict=True):
+    numbers = [number for number, block in enumerate(blocks) if block.count > 0]
+    found, expected = [], 0.0
+    for number in numbers:
+        posterior = Posterior.of((whole - blocks[number]).scaled(1 / correlation, stroke_um), rough, hyper)
+        found.append(non_negative(posterior)[0])
+        # The variances that the posterior gives its predictions of the block.
+        expected += float(np.vdot(inverse(np.asarray(posterior.root)), blocks[number].gram)) * stroke_um**2
+    columns = np.stack(found, axis=1) * stroke_um
+    surface = data.grid.surface(columns if basis is None else basis @ columns)
+    squares = shared = 0.0
+    for run in runs:
+        label = blocks_of(run, data.pieces)
+        left_um = run.displacement_um - _predicted_um(
+            surface, run, np.searchsorted(numbers, label).clip(max=len(numbers) - 1)
+        )
+        for number in numbers:
+            # A short run may have no sample in a block.
             if (inside := label == number).any():
-                left = run.without_nuisance(run.displacement_um - simulate_run(model, run), inside)
-                off.append(run.weighed(left)[inside])
-        squares += sum(float(np.sum(o**2)) for o in off)
-        shared += sum(shared_square(o) * len(o) for o in off)
-        expected += _expected_square(posterior, block) * stroke_um**2
-        count += float(block.count)
+                left = run.without_nuisance(left_um, inside)
+                off = run.weighed(left)[inside]
+                squares += float(np.sum(off**2))
+                shared += shared_square(off) * len(off)
+    count = sum(float(blocks[number].count) for number in numbers)
     return (squares / count) ** 0.5, (max(0.0, shared - expected) / count) ** 0.5
 
 
-def _expected_square(posterior: Posterior, block: Moments) -> float:
-    """Sum over a block of the variances that the posterior gives its predictions."""
-    return float(np.trace(scipy.linalg.cho_solve((posterior.root, True), block.gram)))
+def _predicted_um(surface: Surface, run: Run, which: np.ndarray) -> np.ndarray:
+    """Predict each sample of a run by one of several surfaces, `(n,)`."""
+    found, first = [], 0
+    for piece in run.path:
+        every = surface.respond(piece)
+        found.append(np.take_along_axis(every, which[first : first + len(every), None], axis=1)[:, 0])
+        first += len(every)
+    return np.concatenate(found)

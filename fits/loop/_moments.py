@@ -7,9 +7,10 @@ voltages and a 4 x 4 mixing matrix. What a fit costs then depends on the path, n
 
 import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import reduce
-from typing import Any
+from itertools import pairwise
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fits.loop._design import Grid, branch_table, responses
+from fits.loop._design import Columns, Grid, Responses, branch_table, rectangles
 from fits.loop._past import past_columns
 from fits.loop._path import Path, branches
 from fits.loop._prediction import PIECE
@@ -29,8 +30,8 @@ _NEGLIGIBLE = 1e-14
 _AT_ONCE = 16
 # How many such parts are gone through in silence: a million samples.
 _TOLD = 8
-# Numbers in the rows that are regressed at a time: 16 MB.
-_VALUES = 2_000_000
+# Numbers of which responses are made at a time, 16 MB, and rows that are: these stay in a processor's cache.
+_VALUES, _ROWS = 2_000_000, 512
 BLOCKS = 5
 # Short enough for each block to have seen all of a record: fifths of one that swings ever farther would not.
 PIECES = 40
@@ -42,7 +43,7 @@ class Compressed:
 
     Sums of squares and products of `mix @ response(voltage_V) ~ target_um` equal those of the samples; the squares
     that no response could explain are in `residue_um2`. `block` is -1, and `mix` zero, where samples are not used;
-    `count` is their number, each as often as it counts.
+    `count` is their number, each as often as it counts. A group is a `whole` visit, or its samples are not mixed.
     """
 
     voltage_V: np.ndarray
@@ -51,6 +52,19 @@ class Compressed:
     block: np.ndarray
     count: np.ndarray
     residue_um2: np.ndarray
+    whole: np.ndarray
+
+    def some(self, which: slice) -> Self:
+        """Some of the groups."""
+        return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
+
+    def order(self, path: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Entries that are used, `(m,)`, block by block, like branches together; and where each block begins."""
+        level_V = np.where(self.whole[:, None], self.voltage_V[:, 1:2], self.voltage_V).ravel()
+        block = np.repeat(self.block, _SLOTS)
+        order = np.lexsort((level_V, path.rising[path.lead :], block))
+        bounds = np.searchsorted(block[order], np.arange(BLOCKS + 1))
+        return order[bounds[0] :], bounds - bounds[0]
 
 
 def compressed(run: Run, levels_V: np.ndarray, pieces: int) -> Iterator[Compressed]:
@@ -109,6 +123,7 @@ def _compress(run: Run, path: Sequence[Path], samples: slice, levels_V: np.ndarr
         block=block[first],
         count=np.where(used, np.add.reduceat(share, first), 0.0),
         residue_um2=np.where(used, residue, 0.0),
+        whole=dense,
     )
 
 
@@ -219,19 +234,25 @@ def grid_of(runs: Sequence[Run], levels: int) -> Grid:
 
 
 def gather(
-    grid: Grid, runs: Sequence[Run], pieces: int = PIECES, progress: Callable[[str], None] = lambda _: None
+    grid: Grid,
+    runs: Sequence[Run],
+    pieces: int = PIECES,
+    progress: Callable[[str], None] = lambda _: None,
+    beside: Columns | None = None,
 ) -> Data:
     """Pass runs with displacement through the regression once; blocks are made of so many pieces of each run.
 
-    Told is how far that is in long runs.
+    Told is how far that is in long runs. Behind the columns of the grid there may be others `beside` them, of finer
+    levels among which are those of the grid.
     """
     centred: list[list[Moments]] = []
     means = []
-    levels_V = np.linspace(float(grid.lower_V), float(grid.upper_V), grid.levels)
+    kinds = [Columns(branch_table(grid.levels), rectangles), *([] if beside is None else [beside])]
+    levels_V, size = np.linspace(*grid.ends_V, kinds[-1].levels), sum(kind.size for kind in kinds)
     for run in runs:
-        sums = _sums(grid, run, _told(compressed(run, levels_V, pieces), run, progress))
-        total, mean = without_nuisance(reduce(operator.add, sums), grid.columns)
-        centred.append([total, *(without_nuisance(part, grid.columns)[0] for part in sums)])
+        sums = _sums(kinds, run, _told(compressed(run, levels_V, pieces), run, progress))
+        total, mean = without_nuisance(reduce(operator.add, sums), size)
+        centred.append([total, *(without_nuisance(part, size)[0] for part in sums)])
         means.append(mean)
     whole, *blocks = (reduce(operator.add, parts) for parts in zip(*centred, strict=True))
     return Data(grid, whole, tuple(blocks), tuple(means), pieces)
@@ -245,31 +266,33 @@ def _told(parts: Iterator[Compressed], run: Run, progress: Callable[[str], None]
             progress(f"  {k * _AT_ONCE * PIECE:,} of {len(run.record):,} samples")
 
 
-def _sums(grid: Grid, run: Run, parts: Iterable[Compressed]) -> list[Moments]:
+def _sums(kinds: Sequence[Columns], run: Run, parts: Iterable[Compressed]) -> list[Moments]:
     """Moments per block, with the nuisance parameters at the end: those of a past that is estimated, and ones."""
     sums: list[Moments] = []
-    table, before_V = branch_table(grid.levels), run.extremes_V
+    before_V, length = run.extremes_V, max(_VALUES // (_SLOTS * kinds[-1].levels), 1)
     for groups in parts:
-        beside = _beside(run, groups)
-        size = grid.columns + beside.shape[2]
-        sums = sums or [Moments.empty(size) for _ in range(BLOCKS)]
-        length = max(_VALUES // (_SLOTS * size), 1)
         for begin in range(0, len(groups.block), length):
-            piece = slice(begin, begin + length)
-            path, mix = Path.of(before_V, groups.voltage_V[piece].ravel()), groups.mix[piece]
+            some = groups.some(slice(begin, begin + length))
+            path = Path.of(before_V, some.voltage_V.ravel())
             before_V = path.end
-            columns = responses(grid, table, path).reshape(len(mix), _SLOTS, -1)
-            rows = np.concatenate([mix @ columns, mix @ beside[piece]], axis=2).reshape(-1, size)
-            for block in np.unique(groups.block[piece]):
-                if block < 0:
-                    continue
-                which = groups.block[piece] == block
-                # NumPy hands `a.T @ a` to BLAS as a rank-k update.
-                part = rows[np.repeat(which, 4)]
-                target = groups.target_um[piece][which].ravel()
-                energy = target @ target + groups.residue_um2[piece][which].sum()
-                count = np.asarray(groups.count[piece][which].sum(), dtype=float)
-                sums[block] = sums[block] + Moments(part.T @ part, target @ part, energy, count)
+            order, bounds = some.order(path)
+            beside = _beside(run, some)
+            nuisance = (some.mix @ beside).reshape(-1, beside.shape[2])[order].T
+            place = (run.lower_V, run.upper_V), path, some.mix, some.whole, order
+            responses = [Responses(kind, *place) for kind in kinds]
+            target_um = some.target_um.ravel()[order]
+            sums = sums or [Moments.empty(sum(kind.size for kind in kinds) + len(nuisance))] * BLOCKS
+            for number, (first, stop) in enumerate(pairwise(bounds)):
+                energy, count = (each[some.block == number].sum() for each in (some.residue_um2, some.count))
+                gram, cross = np.zeros_like(sums[number].gram), np.zeros_like(sums[number].cross_um)
+                for k in range(first, stop, _ROWS):
+                    which = slice(k, min(k + _ROWS, stop))
+                    rows = np.concatenate([*(one.of(which) for one in responses), nuisance[:, which]])
+                    # NumPy hands `a @ a.T` to BLAS as a rank-k update.
+                    gram += rows @ rows.T
+                    cross += rows @ target_um[which]
+                    energy += target_um[which] @ target_um[which]
+                sums[number] = sums[number] + Moments(gram, cross, energy, count)
     return sums
 
 

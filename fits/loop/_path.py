@@ -75,6 +75,13 @@ class Path:
         return np.asarray(self.values[chain[::-1]])
 
     @cached_property
+    def turns(self) -> tuple[Self, np.ndarray]:
+        """The path of those entries alone from which branches hang; and where each entry's anchor is among them."""
+        entries = np.unique(self.anchor)
+        at = np.searchsorted(entries, self.anchor)
+        return type(self)(self.values[entries], at[entries], self.rising[entries], self.depth[entries]), at
+
+    @cached_property
     def levels(self) -> list[np.ndarray]:
         """Entries whose anchor is not the first, by their depth: each adds to one of the level before."""
         order = np.argsort(self.depth, kind="stable")

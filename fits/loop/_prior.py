@@ -6,6 +6,7 @@ traced programs, such as many fits at once, it is JAX's.
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
@@ -212,46 +213,69 @@ def _unchecked(xp: Any) -> dict[str, Any]:
 class Evidence:
     """Negative logarithm of the evidence of moments, but for a constant (MacKay 1992; Rasmussen & Williams 2006).
 
-    Values and slopes are those at the logarithms of `Hyper`, in its order, shape `(5,)`, or `(6,)` with plays.
+    Values and slopes are those at the logarithms of `Hyper`, in its order, shape `(5,)`, or `(6,)` with plays. Both
+    are not numbers where a matrix has no Cholesky factor.
     """
 
     def __init__(self, moments: Moments, rough: Roughness):
         self._moments = jax.tree.map(np.asarray, moments)
-        self._rough = jax.tree.map(np.asarray, rough)
+        self._size = len(self._moments.cross_um)
+        forms = [np.asarray(form) for form in jax.tree.leaves(rough)]
+        self._forms = np.stack([form.ravel() for form in forms])
+        self._diagonals = np.stack([np.diagonal(form) for form in forms])
+        # Stretches of columns that no form couples with others, but for plays, none of which it couples.
+        coupled = np.any(self._forms, axis=0).reshape(self._size, self._size)
+        last = np.maximum.accumulate([np.flatnonzero(row).max(initial=k) for k, row in enumerate(coupled)])
+        ends = np.flatnonzero(last == np.arange(self._size)) + 1
+        ends = ends[np.diff(ends, prepend=0) > 1]
+        self._parts = [slice(*ends) for ends in pairwise([0, *ends[ends < self._size], self._size])]
 
     def value(self, logs: np.ndarray) -> float:
-        """The value; not a number where a matrix has no Cholesky factor."""
-        moments, variance = self._moments, np.exp(logs[4])
-        prior = self._rough.precision(Hyper.of(*logs))
-        root, prior_root = cholesky(moments.gram / variance + prior), cholesky(prior)
-        half = scipy.linalg.solve_triangular(root, moments.cross_um / variance, lower=True, check_finite=False)
-        misfit = moments.energy_um2 / variance - half @ half
-        volume, prior_volume = (2 * np.sum(np.log(np.diagonal(one))) for one in (root, prior_root))
-        # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
-        unlikely = np.sum(_off_middling(logs) ** 2)
-        return float(moments.count * logs[4] + misfit + volume - prior_volume + unlikely) / 2
+        """The value alone."""
+        return self._value(logs, *self._roots(logs))
 
     def of(self, hyper: Hyper) -> float:
         """The evidence itself."""
         return -self.value(np.array([float(log) for log in jax.tree.leaves(hyper)]))
 
     def slope(self, logs: np.ndarray) -> np.ndarray:
-        """The derivatives, of the same shape."""
+        """The derivatives alone, of the same shape."""
+        return self._slope(logs, *self._roots(logs))
+
+    def both(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
+        """Value and derivatives, which share what takes long."""
+        roots = self._roots(logs)
+        return self._value(logs, *roots), self._slope(logs, *roots)
+
+    def _roots(self, logs: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Cholesky factors of the precision, and of parts of the prior's, see `Roughness.precision`; lower ones."""
+        weights = np.exp(np.delete(logs, 4))
+        prior = (weights @ self._forms).reshape(self._size, self._size)
+        prior[np.diag_indices(self._size)] += 1 / 100.0**2 + _ROUNDING * np.max(weights @ self._diagonals)
+        parts = [cholesky(prior[part, part]) for part in self._parts]
+        return cholesky(self._moments.gram / np.exp(logs[4]) + prior), parts
+
+    def _value(self, logs: np.ndarray, root: np.ndarray, prior_roots: list[np.ndarray]) -> float:
         moments, variance = self._moments, np.exp(logs[4])
-        prior = self._rough.precision(Hyper.of(*logs))
-        weights = np.delete(logs, 4)
-        forms = [np.exp(log) * form for log, form in zip(weights, jax.tree.leaves(self._rough), strict=True)]
-        # The floor of the precision follows its largest diagonal entry.
-        largest = int(np.argmax(sum(np.diagonal(form) for form in forms)))
-        covariance, alone = _inverse(moments.gram / variance + prior), _inverse(prior)
+        half = scipy.linalg.solve_triangular(root, moments.cross_um / variance, lower=True, check_finite=False)
+        misfit = moments.energy_um2 / variance - half @ half
+        volume, *parts = (2 * np.sum(np.log(np.diagonal(one))) for one in (root, *prior_roots))
+        # Where the evidence is flat the smoothness stays within some times six e-folds of a middling one.
+        unlikely = np.sum(_off_middling(logs) ** 2)
+        return float(moments.count * logs[4] + misfit + volume - sum(parts) + unlikely) / 2
+
+    def _slope(self, logs: np.ndarray, root: np.ndarray, prior_roots: list[np.ndarray]) -> np.ndarray:
+        moments, variance, weights = self._moments, np.exp(logs[4]), np.exp(np.delete(logs, 4))
+        covariance = inverse(root)
         mean = covariance @ moments.cross_um / variance
-        out = 2 * _off_middling(logs) / _WIDTH
-        for k, form in enumerate(forms):
-            floor = _ROUNDING * form[largest, largest]
-            wide = np.sum((covariance - alone) * form) + floor * np.trace(covariance - alone)
-            out[k] += mean @ form @ mean + floor * (mean @ mean) + wide
+        square = covariance + np.outer(mean, mean)
+        for part, prior_root in zip(self._parts, prior_roots, strict=True):
+            square[part, part] -= inverse(prior_root)
+        # The floor of the precision follows its largest diagonal entry.
+        floor = _ROUNDING * self._diagonals[:, np.argmax(weights @ self._diagonals)]
+        out = 2 * _off_middling(logs) / _WIDTH + weights * (self._forms @ square.ravel() + floor * np.trace(square))
         left = moments.energy_um2 - 2 * mean @ moments.cross_um + mean @ moments.gram @ mean
-        of_noise = moments.count - (left + np.sum(covariance * moments.gram)) / variance
+        of_noise = moments.count - (left + np.vdot(covariance, moments.gram)) / variance
         return np.insert(out, 4, of_noise) / 2
 
 
@@ -261,18 +285,26 @@ def _off_middling(logs: np.ndarray) -> np.ndarray:
     return np.asarray((weights - _MIDDLING[: len(weights)]) / _WIDTH)
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    return np.asarray(scipy.linalg.cho_solve((cholesky(matrix), True), np.eye(len(matrix)), check_finite=False))
+def inverse(root: np.ndarray) -> np.ndarray:
+    """Inverse of a matrix by its lower Cholesky factor."""
+    # LAPACK counts along columns: its upper factor is the lower one transposed, and it fills in one triangle.
+    half, failed = scipy.linalg.lapack.dpotri(root.T, lower=0)
+    if failed:
+        return np.full_like(root, np.nan)
+    full = half + half.T
+    full[np.diag_indices(len(full))] /= 2
+    return np.asarray(full)
 
 
-def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper) -> Hyper:
-    """Find the smoothness and the noise under which the data, in strokes, are most probable."""
-    evidence = Evidence(moments, rough)
+def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper | None) -> Hyper:
+    """Find the smoothness and the noise under which the data, in strokes, are most probable, from a start if any."""
+    evidence, cold = Evidence(moments, rough), start is None
+    start = Hyper.start() if start is None else start
     first = np.array([float(log) for log in jax.tree.leaves(start)])
     # A step too far is not finite, and taken back. Out of steps on a flat evidence, the best place so far is as good
     # as any; the regression itself must converge.
     with np.errstate(all="ignore"):
-        return Hyper.of(*minimise(evidence.value, evidence.slope, first, rtol=1e-3, atol=1e-2, most_steps=128))
+        return Hyper.of(*minimise(evidence.both, first, 1e-3, 1e-2, most_steps=128, cold=cold))
 
 
 def effective(rough: Roughness, hyper: Hyper, posterior: Posterior) -> Float[Array | np.ndarray, ""]:

@@ -36,10 +36,8 @@ class Visits:
         begins = np.ones(len(interval), dtype=bool)
         begins[1:] = (np.diff(interval) != 0) | (np.diff(anchor) != 0) | (rising[1:] != rising[:-1])
         first = np.flatnonzero(begins)
-        entries = np.unique(path.anchor)
-        back = np.searchsorted(entries, path.anchor[entries])
-        turns = Path(path.values[entries], back, path.rising[entries], path.depth[entries])
-        at = _alike(turns)[np.searchsorted(entries, anchor[first])]
+        turns, where = path.turns
+        at = _alike(turns)[where[path.lead :][first]]
         key = (at * surface.intervals + interval[first]) * 2 + rising[first]
         _, one, number = np.unique(key, return_index=True, return_inverse=True)
         which = first[one]

@@ -8,19 +8,21 @@ import scipy
 
 
 def minimise(
-    value: Callable[[np.ndarray], float],
-    slope: Callable[[np.ndarray], np.ndarray],
+    both: Callable[[np.ndarray], tuple[float, np.ndarray]],
     start: np.ndarray,
     rtol: float,
     atol: float,
     most_steps: int,
+    cold: bool = False,
 ) -> np.ndarray:
     """Go down from a start, shape `(k,)`, to where steps and gains are small, or as far as so many steps lead.
 
-    A step counts as small where each variable, and the value, change by less than `atol` and `rtol` of their size.
-    By itself SciPy goes on until the slope is small, which rounding may keep it from. What is not finite is too far.
+    `both` gives the value and its derivatives, `(k,)`. A step counts as small where each variable, and the value,
+    change by less than `atol` and `rtol` of their size. By itself SciPy goes on until the slope is small, which
+    rounding may keep it from. A first step from a `cold` start may be small because it is along what is known best:
+    it ends nothing. What is not finite is too far.
     """
-    before, now = start, value(start)
+    before, now = start, np.inf if cold else both(start)[0]
 
     def end(intermediate_result: Any) -> None:
         nonlocal before, now
@@ -30,10 +32,10 @@ def minimise(
         if np.all(moved < atol + rtol * np.abs(x)) and gained < atol + rtol * abs(reached):
             raise StopIteration
 
-    def finite(x: np.ndarray) -> float:
-        found = value(x)
-        return found if np.isfinite(found) else np.inf
+    def finite(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = both(x)
+        return value if np.isfinite(value) else np.inf, slope
 
     options = {"maxiter": most_steps, "gtol": 0.0}
-    found = scipy.optimize.minimize(finite, start, jac=slope, method="BFGS", callback=end, options=options)
+    found = scipy.optimize.minimize(finite, start, jac=True, method="BFGS", callback=end, options=options)
     return np.asarray(found.x)
