@@ -1,0 +1,59 @@
+"""A lag of the readings behind a driver and a resonance: the plain stage bends its poles for it."""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from fits import Record, diagnose
+
+NOISE_um, SLOW_Hz, FAST_Hz = 0.03, 200.0, 3000.0
+TURNS_V = 0, 100, 0, 100, 75, 100, 50, 100, 25, 100, 0, 85, 15, 75, 25, 60, 40, 50, 0
+
+
+def ways_V(turns_V, rate_V_per_s, rate_Hz):
+    way_V = np.r_[0, np.cumsum(np.abs(np.diff(turns_V)))]
+    return np.interp(np.arange(0, way_V[-1], rate_V_per_s / rate_Hz), way_V, turns_V)
+
+
+def through(above, below, values, rate_Hz):
+    """Exact for what runs in lines between the samples."""
+    over, under, _ = cont2discrete((above, below), 1 / rate_Hz, "foh")
+    return lfilter(np.ravel(over), under, values - values[0]) + values[0]
+
+
+def measured(rng, voltage_V, rate_Hz, lags_s, natural, damping, source):
+    """Driver, 60 plays of gamma-distributed widths, a resonance and the sensor, in steps of a few samples' parts."""
+    parts = int(np.ceil(20 / (rate_Hz * min(*lags_s, 1 / natural))))
+    fine = np.interp(np.arange((len(voltage_V) - 1) * parts + 1) / parts, np.arange(len(voltage_V)), voltage_V)
+    driven = through([1], [lags_s[0], 1], fine, rate_Hz * parts)
+    half_V = np.sort(np.random.default_rng(1).gamma(2.0, 6.0, 60))
+    place, moved = driven[0] + half_V, np.empty(len(driven))
+    for k, voltage in enumerate(driven):
+        place = np.minimum(np.maximum(place, voltage - half_V), voltage + half_V)
+        moved[k] = 0.12 * voltage + 0.05 * place.mean()
+    moved = through([natural**2], [1, 2 * damping * natural, natural**2], moved, rate_Hz * parts)
+    reading = through([1], [lags_s[1], 1], moved, rate_Hz * parts)[::parts]
+    noise = NOISE_um * rng.standard_normal(len(reading))
+    return Record(np.arange(len(reading)) / rate_Hz, voltage_V, reading + noise, source=source)
+
+
+@pytest.mark.study
+def test_a_lag_for_which_the_poles_bend_is_named_alone(rng):
+    """It had been called a second resonance, or a delay and friction."""
+    driver_s, lag_s = rng.uniform(3e-4, 1.2e-3), rng.uniform(3.5e-3, 5e-3)
+    rig = (driver_s, lag_s), 2 * np.pi * rng.uniform(100, 140), rng.uniform(0.03, 0.1)
+    waves = np.arange(2, 300, 2.0)
+    time_s = np.arange(0, 1.0, 1 / FAST_Hz)
+    multisine = np.cos(2 * np.pi * np.outer(time_s, waves) + rng.uniform(0, 2 * np.pi, len(waves))).sum(axis=1)
+    multisine *= 15 / np.abs(multisine).max()
+    fast_V = np.r_[ways_V([0, 100, 0, 50 + multisine[0]], 600.0, FAST_Hz), 50 + multisine]
+    slow_V = ways_V(TURNS_V, 100.0, SLOW_Hz)
+    found = diagnose(
+        [measured(rng, slow_V, SLOW_Hz, *rig, "slow.csv"), measured(rng, fast_V, FAST_Hz, *rig, "fast.csv")]
+    )
+    print(found.summary())
+    (cause,) = found.causes
+    assert cause.name == "sensor_lowpass"
+    value = next(one for one in cause.parameters if one.name == "time_constant_s")
+    assert abs(value.value - lag_s) < 0.05 * lag_s
+    assert found.gain.heldout_rms_after_um < 1.2 * NOISE_um
