@@ -39,7 +39,7 @@ class Cause:
 
     `z` is the evidence for it when it was found, in standard deviations, `p_family` the probability of as much
     evidence for any effect by chance, and `drop` the decrease of the sum of squares, in noise variances. `rivals` are
-    the effects that explain the same about as well, the best first.
+    the effects that explain the same about as well, the best first, and `behind` names those that do so better.
     """
 
     name: str
@@ -47,6 +47,7 @@ class Cause:
     p_family: float
     rivals: tuple[Rival, ...]
     drop: float
+    behind: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -199,13 +200,15 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
     thresholds, false_alarm = search.thresholds, search.false_alarm
     bench, projector, model = one.bench, one.projector, one.model
     taken, refused = set(one.names), set[str]()
-    # Models of effects are not exact: what one leaves may look like another, above all like its confusions.
+    # Models of effects are not exact: what one leaves may look like another, above all like its confusions; where
+    # another of its class explains more, like what that one is mistaken for.
+    alike = taken.union(*(cause.behind for cause in one.causes))
     whole = max(search.plain.cost - model.cost, 0.0)
     independent = sum(cause.drop for cause in one.causes if card_of(cause.name).independent)
     explained = max(whole - independent, 0.0) ** 0.5
     bars = {
         scored.form: (whole**0.5 if scored.form.independent else explained)
-        * model_error(scored.name, taken, thresholds)
+        * model_error(scored.name, alike, thresholds)
         for scored in one.left
     }
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
@@ -238,9 +241,10 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
                 continue
             if one.family.p(z / sigma) >= false_alarm or rival.criterion > one.criterion:
                 continue
-            alike = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
-            rivals = tuple(replace(other, end=None) for other in alike)
-            causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / len(new))] * len(new)
+            same = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
+            rivals = tuple(replace(other, end=None) for other in same)
+            behind = tuple(other.name for other in same if other.criterion < rival.criterion)
+            causes = [Cause(rival.name, z, one.family.p(z), rivals, drop / len(new), behind)] * len(new)
             found.append(Explanation.of((*one.causes, *causes), end, search))
         if found:
             return _that_every_rig_has(found, bench)
