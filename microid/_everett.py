@@ -177,11 +177,11 @@ def _pick(table: Float[Array, " q"], index: Int[Array, " n"]) -> Float[Array, " 
     return table.at[index].get(mode="promise_in_bounds")
 
 
-def _basis(s: Float[Array, " n"]) -> tuple[Float[Array, " n"], ...]:
+def _basis(s: Float[Array, " *n"]) -> tuple[Float[Array, " *n"], ...]:
     return (1 - s) ** 2 / 2, 0.5 + s * (1 - s), s**2 / 2
 
 
-def _slope(s: Float[Array, " n"]) -> tuple[Float[Array, " n"], ...]:
+def _slope(s: Float[Array, " *n"]) -> tuple[Float[Array, " *n"], ...]:
     return s - 1, 1 - 2 * s, s
 
 

@@ -59,7 +59,9 @@ def test_public_names_are_the_listed_ones(package):
 
 
 def test_the_version_is_that_of_the_package():
-    assert microid.__version__ == importlib.metadata.version("microid")
+    import fits
+
+    assert microid.__version__ == fits.__version__ == importlib.metadata.version("microid")
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = microid.nothing
 

@@ -5,6 +5,7 @@
 
 import ast
 import importlib
+import importlib.metadata
 import pkgutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,6 +21,8 @@ def late(module: str, file: str) -> tuple[dict[str, str], Callable[[str], Any]]:
     homes = {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def find(name: str) -> Any:
+        if name == "__version__":
+            return importlib.metadata.version("microid")
         if name not in homes:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         return getattr(importlib.import_module(homes[name]), name)
