@@ -73,7 +73,7 @@ def compare_rivals(
     """
     before, first = projector.held_out(model.change_um), len(model.laws)
     fits = list[tuple[Scored, Refit]]()
-    for one in leaders(scores):
+    for one in leaders(scores, bench.baseline.dynamic):
         if not fits or has_time():
             fits.append((one, refit_beside(bench, projector, model, one)))
     least = min(found.cost for _, found in fits)
@@ -105,12 +105,17 @@ def criterion(projector: Projector, model: Refit) -> float:
     return model.criterion(projector.count) + projector.surprise(projector.held_out(model.change_um))
 
 
-def leaders(scores: Sequence[Scored]) -> list[Scored]:
-    """The best of those that explain most: of each effect the best of each form, or several without a strength."""
+def leaders(scores: Sequence[Scored], dynamic: bool) -> list[Scored]:
+    """The best of those that explain most: of each effect the best of each form, or several without a strength.
+
+    A lag beside a `dynamic` stage is always among them: its fit begins elsewhere, and the score there is not known.
+    """
     best = best_of(scores)
     top = max(one.z for one in scores)
+    names = [name for name, one in best.items() if one.z > _WORTH * top][:_LEADERS]
+    names += [name for name, one in best.items() if dynamic and one.form.lag and name not in names]
     found = []
-    for name in [name for name, one in best.items() if one.z > _WORTH * top][:_LEADERS]:
+    for name in names:
         tried: dict[type, int] = {}
         for one in sorted((one for one in scores if one.name == name), key=lambda s: -s.z):
             most = 1 if one.form.strength else _FORMS

@@ -224,7 +224,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
         fitted = compare_rivals(
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )
-        refused |= {s.name for s in leaders(open_)} - {rival.name for rival in fitted}
+        refused |= {s.name for s in leaders(open_, bench.baseline.dynamic)} - {rival.name for rival in fitted}
         found = []
         for rival in [rival for rival in fitted if rival.end is not None]:
             refused.add(rival.name)

@@ -25,7 +25,7 @@ from fits.stage._run import (
     yields_inside,
 )
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
-from fits.stage._start import measure_response, start_stages
+from fits.stage._start import measure_response, start_lagging, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Hold, Mechanics, Preisach, Stage, innermost
 
@@ -184,7 +184,14 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
         if not plan.accept_best and fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
             return lagging
-        raise
+        ends = start_lagging(stage, responses) if plan.accept_best else []
+        if not ends:
+            raise
+        # Without a lag of the reading a fit may run away from poles that the runs show beside it.
+        starts = [replace(problem, z=np.asarray(problem.chain.coordinates.of(one)), hyper=None) for one, _ in ends]
+        solved = replace(_best_start(plan, starts, runs), hyper=hyper)
+        dropped, problem = None, solved.onward
+        refuse_unidentifiable(solved, drives, fast=fast != slow)
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
