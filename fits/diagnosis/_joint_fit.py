@@ -25,6 +25,8 @@ _LARGEST_DIFFERENCE = 1.0
 _LARGER, _BETTER = 1.5, 10.0
 # What ended at its bound is tried again from this part of it.
 _WEAKER = 0.8
+# Of places where a fit may begin so many are followed.
+_STARTS = 2
 # Rounds in which the baseline follows that first.
 _FIRST = 2
 # Further rounds in which baseline and causes follow each other, at most.
@@ -80,7 +82,7 @@ def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[Sta
         replace(run, record=replace(run.record, displacement_um=run.displacement_um - um))
         for run, um in zip(baseline.runs, others_um, strict=True)
     ]
-    found = []
+    starts = list[State]()
     for stage, lag_s in start_lagging(baseline.stage, list(map(measure_response, cleaned, drives))):
         there = replace(baseline, z=np.asarray(baseline.chain.coordinates.of(stage)))
         effects = [law.effect(model.x[-1], run) for run in range(len(baseline.runs))]
@@ -88,8 +90,8 @@ def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[Sta
         laws, x = model.with_law(len(model.laws) - 1, started)
         here = refit(bench, projector, laws, x, 0)
         state = _linearised_at(there, projector, here)
-        found.append(alternate(*state, refit(*state, laws, x, 4)))
-    return found
+        starts.append((*state, refit(*state, laws, x, 4)))
+    return [alternate(*state) for state in sorted(starts, key=lambda state: state[-1].cost)[:_STARTS]]
 
 
 def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)) -> State:

@@ -12,7 +12,7 @@ from fits.loop._misfit import Misfit, compare_gains
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.stage._run import named_parts, residual_of, simulate_stage
-from fits.stage._solve import Solved, marginal_information
+from fits.stage._solve import Solved
 from fits.stats._noise import correlation_samples, learn_noise
 from microid import Driver, Mechanics, Stage
 
@@ -81,10 +81,11 @@ def refuse_unidentifiable(
     (`may_drop`) that the runs do not show, though they are sampled finely enough, its name is returned instead.
     """
     stage = solved.stage
-    information = marginal_information(solved.weighing.total(solved.sums), 0, None, solved.weighing.least_um**2)
     named, value, derivative = solved.problem.chain.parameters(solved.z)
     slope = np.abs(derivative) / np.maximum(np.abs(value), 1e-300)
-    spread = 1 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    # Beside columns as they are, which come first.
+    own = np.diagonal(np.asarray(solved.weighing.total(solved.sums).gram))[-len(named) :]
+    spread = solved.weighing.least_um / np.sqrt(np.maximum(own, 1e-300))
     # At a bound the slope vanishes, however far the coordinate may run.
     unseen = (spread * slope > UNSEEN) | (spread > 5)
     endings = ".time_constant_s", ".natural_frequency_Hz"

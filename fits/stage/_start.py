@@ -14,6 +14,8 @@ from fits.stage._run import named_parts
 from microid import AbstractLinear, Driver, Mechanics, Stage
 
 _LINES = 6
+# Logarithms of poles nearer than this are the same.
+_SAME = 0.05
 # Lines of a response that are kept, spread evenly over the logarithm of the frequency and around the largest.
 _MOST_LINES = 240
 
@@ -102,12 +104,13 @@ def start_lagging(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[t
     problem, ends = found
     places = np.cumsum([1 if driver else 2 for driver in drivers]) - 1
     swaps = [[at, -1] for at, driver in zip(places, drivers, strict=True) if driver]
-    out = []
-    for swap in swaps[::-1]:
-        x = ends[0].copy()
-        x[swap] = x[swap[::-1]]
-        out.append((problem.applied(stage, moved, x), float(np.exp(x[-1]))))
-    return out
+    swapped = []
+    for x in ends:
+        for swap in swaps[::-1]:
+            other = x.copy()
+            other[swap] = x[swap[::-1]]
+            swapped.append(other)
+    return [(problem.applied(stage, moved, x), float(np.exp(x[-1]))) for x in _distinct(swapped, _SAME)]
 
 
 def _moved(stage: Stage) -> list[str]:
@@ -135,7 +138,7 @@ def _poles(
     sampled = [one.sampled for one in responses if one.sampled is not None]
     if sampled:
         ends = [problem.refined_in_time([*ends, *_distinct(ranked, 0.2)], sampled, fixed), *ends]
-    return problem, _distinct(ends, 0.05)[:3]
+    return problem, _distinct(ends, _SAME)[:3]
 
 
 def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) -> list[float]:

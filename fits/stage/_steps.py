@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,9 +26,10 @@ from fits.stage._run import (
     yields_inside,
 )
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
-from fits.stage._start import measure_response, start_lagging, start_stages
+from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Hold, Mechanics, Preisach, Stage, innermost
+from microid.effects import EFFECTS
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
@@ -184,20 +186,33 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
         if not plan.accept_best and fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
             return lagging
-        ends = start_lagging(stage, responses) if plan.accept_best else []
-        if not ends:
+        if not plan.accept_best or (beside := _beside_lag(plan, problem, runs, responses)) is None:
             raise
-        # Without a lag of the reading a fit may run away from poles that the runs show beside it.
-        starts = [replace(problem, z=np.asarray(problem.chain.coordinates.of(one)), hyper=None) for one, _ in ends]
-        solved = replace(_best_start(plan, starts, runs), hyper=hyper)
-        dropped, problem = None, solved.onward
-        refuse_unidentifiable(solved, drives, fast=fast != slow)
+        refuse_unidentifiable(beside, drives, fast=fast != slow)
+        poles = problem.chain.coordinates.of(beside.stage.without(beside.stage.names[-1]))
+        return replace(problem, z=np.asarray(poles), columns_um=beside.columns_um)
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
         remarks = (_no_resonance(plan, dropped), *simpler.remarks)
         return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
+
+
+def _beside_lag(
+    plan: Plan, problem: Problem, runs: list[Run], responses: Sequence[MeasuredResponse]
+) -> Solved | None:
+    """Fit roughly with a lag of the reading at the end, which the stage lacks; None where the responses say nothing.
+
+    Without that lag a fit may run away from poles that the runs show beside it.
+    """
+    lagging: Any = next(form for form in EFFECTS if form.lag)
+    starts = []
+    for stage, lag_s in start_lagging(problem.stage, responses):
+        lagged = stage.append(lagging.name, lagging(**{lagging.lag: jnp.asarray(lag_s)}))
+        held = lagged.freeze(*(f"{lagging.name}.{field}" for field in lagging.history))
+        starts.append(Problem.of(held, problem.chain.grid, problem.columns_um, problem.hyper, problem.stroke_um))
+    return _best_start(plan, starts, runs) if starts else None
 
 
 def _no_resonance(plan: Plan, name: str) -> str:
