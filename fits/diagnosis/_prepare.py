@@ -8,9 +8,11 @@ import numpy as np
 
 from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
 from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
-from fits.diagnosis._effects import Bench, drop_programs
+from fits.diagnosis._effects import Bench, Law, drop_programs
+from fits.diagnosis._joint_fit import fit_from_poles
 from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
@@ -147,6 +149,22 @@ class _Fit:
             return explains and beside > (1 - off) * best
         return gained > least and beside > best
 
+    def left_beside_lag(self) -> float:
+        """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""
+        probe = next((probe for probe in self.probed[0] if probe.form.lag), None)
+        if probe is None:
+            return np.inf
+        law = Law([probe.effects[0]] * len(self.regression.baseline.runs))
+        model = refit(self.bench, self.projector, [law], [law.start], 0)
+        ends = fit_from_poles(self.bench, self.projector, model)
+        return min((end[-1].cost for end in ends), default=np.inf)
+
+    def outdoes(self, other: "_Fit") -> bool:
+        """Whether a lag of the reading leaves less here than another fit does with the best effect beside it."""
+        there = Projector(other.regression, self.faults.noise).bounded()
+        left = there.off(there.residual)
+        return self.left_beside_lag() < float(left @ left) - other.largest_z() ** 2
+
     def largest_z(self, left: np.ndarray | None = None) -> float:
         """Evidence of the effect that has most, in what is `left`."""
         scores = score(self.projector, self.probed[0], self.left if left is None else left).each
@@ -180,7 +198,10 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
         if here.regression.baseline.dynamic and here.prefers(hold, reading.thresholds):
             progress(f"fitting the plain stage again, its command {words}")
             drop_programs(records)
-            here, taken = fitted(hold, here.regression.baseline.problem), remark
+            other = fitted(hold, here.regression.baseline.problem)
+            # What comes late at a sensor looks like a command that does so between samples.
+            if not here.outdoes(other):
+                here, taken = other, remark
             drop_programs(records)
     said = (*said, taken) if taken else said
     if here.regression.baseline.dynamic:
