@@ -130,3 +130,51 @@ class SelfHeating(AbstractEffect):
         # The part before the record was at rest, and cold.
         heat = _lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
         return Signal(signal.values + self.gain * heat * (signal.values - self.zero_um), signal.before, signal.hold)
+
+
+@register
+class ApproachingGain(AbstractEffect):
+    r"""A gain that approaches its balance while the stage does, where no temperature was measured.
+
+    .. math:: w_0 + (w - w_0) (1 + g e^{-t / \tau})
+
+    Attributes
+    ----------
+    gain
+        `g`: by which part the gain is larger at the first sample than in balance.
+    time_constant_s
+        `tau`.
+    zero_um
+        `w0`, the displacement that stays, given.
+    """
+
+    name: ClassVar[str] = "thermal_gain"
+    form: ClassVar[str] = "exponential"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain",)
+    unless: ClassVar[tuple[str, ...]] = ("temperature_degC",)
+    per_run: ClassVar[bool] = True
+    fingerprint: ClassVar[str] = ThermalGain.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
+    experiment: ClassVar[str] = ThermalGain.experiment
+    source: ClassVar[str] = "Newton's law of cooling; 0.1 to 0.5 % per K and time constants of minutes are estimates"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
+    gain: Float[Array, ""] = param(unit="1", scale=0.01)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Time constants in steps of half a decade, from a thirtieth of the record to three of it."""
+        grid = _decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
+        return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant)),) for constant in grid)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Scale the displacement."""
+        time = _times_of(time_s, signal.values.shape[0])
+        more = self.gain * jnp.exp(-time / self.time_constant_s)
+        before = signal.before + self.gain * (signal.before - self.zero_um)
+        return Signal(signal.values + more * (signal.values - self.zero_um), before, signal.hold)
