@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from fits.diagnosis._projector import _definite
 from fits.loop._grid import non_negative
-from fits.loop._prior import Posterior, cholesky
+from fits.loop._prior import Posterior, cholesky, definite
 
 
 def indefinite(rng, size=40, below=1e-11):
@@ -20,7 +19,7 @@ def indefinite(rng, size=40, below=1e-11):
 def test_a_precision_without_a_factor_gets_one_and_keeps_what_it_says(rng):
     precision = indefinite(rng)
     assert not np.all(np.isfinite(cholesky(precision)))
-    raised, root = _definite(precision)
+    raised, root = definite(precision)
     np.testing.assert_allclose(root @ root.T, raised, rtol=0, atol=1e-14)
     np.testing.assert_allclose(raised, precision, rtol=0, atol=1e-9)
 
@@ -28,7 +27,7 @@ def test_a_precision_without_a_factor_gets_one_and_keeps_what_it_says(rng):
 def test_a_precision_with_a_factor_stays_as_it_is(rng):
     matrix = rng.standard_normal((30, 10))
     precision = matrix.T @ matrix
-    kept, root = _definite(precision)
+    kept, root = definite(precision)
     assert kept is precision
     np.testing.assert_array_equal(root, np.linalg.cholesky(precision))
 

@@ -13,6 +13,7 @@ from fits.diagnosis._extension import shared_effects
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, changes_along
 from fits.diagnosis._result import FoundCause
+from fits.loop._prior import definite
 from fits.loop._result import ParameterEstimate
 from fits.stage._moments import Chain
 from fits.stage._run import place_of_hysteresis
@@ -82,7 +83,7 @@ class Certainty:
         joined = joined - nuisance @ (nuisance.T @ joined)
         precision = joined.T @ joined + NO_PRECISION * np.eye(few + others)
         precision[:few, :few] += prior
-        factor = np.linalg.inv(np.linalg.cholesky(precision)) @ whole.T
+        factor = np.linalg.inv(definite(precision)[1]) @ whole.T
         # As much wider as those of the parameters, where what is left stays alike for a while.
         columns_um, moves = factor[:, :size], factor[:, size:]
         moves = moves * np.maximum(self._sd / np.maximum(np.linalg.norm(moves, axis=0), 1e-300), 1.0)

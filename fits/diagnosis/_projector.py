@@ -13,15 +13,13 @@ from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._records import LONG
 from fits.diagnosis._regression import Regression, regress
 from fits.loop._grid import non_negative
-from fits.loop._prior import Posterior, cholesky
+from fits.loop._prior import Posterior, definite
 from fits.loop._result import FitError, FitStatus
 from fits.stats._compare import surprise
 from fits.stats._noise import Noise
 
 # Part of a column of the tangent, in squares, below which what the others leave of it is rounding.
 _SHOWN = 1e-9
-# Least eigenvalue of a scaled precision, over the largest, that rounding leaves.
-_ROUNDING = 1e-12
 # Standard deviations by which the data press a column that is zero below that, beyond chance.
 _PRESSED_Z = 3.0
 # The farthest that a coordinate moves at a time.
@@ -285,26 +283,13 @@ class Projector:
         alone[live] = np.linalg.solve(block, cross[columns:][live])
         follow[live] = np.linalg.solve(block, gram[columns:, :columns][live])
         precision = gram[:columns, :columns] - gram[:columns, columns:] @ follow
-        precision, root = _definite((precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision)))
+        precision, root = definite((precision + precision.T) / 2 + 1e-12 * np.diag(np.diagonal(precision)))
         step = cho_solve((root, True), cross[:columns] - follow.T @ cross[columns:])
         kept, found = non_negative(Posterior(baseline.columns_um + step, precision, root))
         if not found:
             raise FitError(FitStatus.MAX_STEPS)
         others = alone - follow @ (np.asarray(kept) - baseline.columns_um)
         return others[coordinate], np.asarray(kept)
-
-
-def _definite(precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A precision and its Cholesky factor, with the least eigenvalues raised where rounding left no factor."""
-    root = cholesky(precision)
-    floor = _ROUNDING
-    while not np.all(np.isfinite(root)):
-        scale = np.sqrt(np.maximum(np.diagonal(precision), 1e-300))
-        value, vector = np.linalg.eigh(precision / scale / scale[:, None])
-        half = (scale[:, None] * vector) * np.sqrt(np.maximum(value, floor * value[-1]))
-        precision = half @ half.T
-        root, floor = cholesky(precision), 10 * floor
-    return precision, root
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

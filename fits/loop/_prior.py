@@ -27,6 +27,8 @@ _MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2), 14.0)
 _WIDTH = 6.0
 # What rounding may take off a diagonal, relative to its largest entry.
 _ROUNDING = 1e-14
+# Least eigenvalue of a scaled precision, over the largest, that rounding leaves.
+_LEAST = 1e-12
 
 
 class Hyper(eqx.Module):
@@ -203,6 +205,19 @@ def cholesky(matrix: Any) -> Any:
         return xp.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
         return np.full_like(matrix, np.nan)
+
+
+def definite(precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A precision and its Cholesky factor, with the least eigenvalues raised where rounding left no factor."""
+    root = cholesky(precision)
+    floor = _LEAST
+    while not np.all(np.isfinite(root)):
+        scale = np.sqrt(np.maximum(np.diagonal(precision), 1e-300))
+        value, vector = np.linalg.eigh(precision / scale / scale[:, None])
+        half = (scale[:, None] * vector) * np.sqrt(np.maximum(value, floor * value[-1]))
+        precision = half @ half.T
+        root, floor = cholesky(precision), 10 * floor
+    return precision, root
 
 
 def _unchecked(xp: Any) -> dict[str, Any]:

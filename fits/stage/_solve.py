@@ -12,7 +12,7 @@ import numpy as np
 from fits.loop._design import Grid
 from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
-from fits.loop._prior import Hyper, roughness
+from fits.loop._prior import Hyper, definite, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run
 from fits.stage._moments import Chain, RunSums, run_sums, split_moments
@@ -284,6 +284,6 @@ def marginal_information(total: Moments, size: int, prior: np.ndarray | None, va
     gram = np.asarray(total.gram) / variance
     if size == 0 or prior is None:
         return gram
-    root = np.linalg.cholesky(gram[:size, :size] + prior)
+    _, root = definite(gram[:size, :size] + prior)
     half = np.linalg.solve(root, gram[:size, size:])
     return gram[size:, size:] - half.T @ half

@@ -13,7 +13,7 @@ from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import BELIEF_LEVELS
 from fits.loop._prediction import Prediction
-from fits.loop._prior import Hyper, interpolation, roughness
+from fits.loop._prior import Hyper, definite, interpolation, roughness
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
@@ -130,7 +130,7 @@ class Precision:
         whole[:size, :few], whole[size:, few:] = basis, np.eye(count)
         precision = whole.T @ self.gram @ whole + NO_PRECISION * np.eye(few + count)
         precision[:few, :few] += prior
-        root = np.linalg.cholesky(precision)
+        _, root = definite(precision)
         factor = np.linalg.solve(root, np.eye(len(root))) @ whole.T
         left = zip(self.solved.residuals_um, self.solved.runs, strict=True)
         shared = float(np.mean([shared_square(one[run.fitted]) for one, run in left]))
