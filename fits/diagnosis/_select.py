@@ -1,5 +1,6 @@
 """Which effects the records need: a search over sets of causes, with refits, and a backward check."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -190,9 +191,21 @@ def select(
 
 def _best(ends: Sequence[Explanation], plain: Refit, thresholds: Thresholds) -> Explanation:
     """The explanation of the smallest criterion; of those that are not told apart, one with no cause near a bound."""
+    ends = [one for one in ends if not any(_adds_little(one, other, plain, thresholds) for other in ends)]
     first = min(ends, key=lambda one: one.criterion)
     reach = confusable_z(plain.cost - first.model.cost, thresholds) ** 2
     return min(ends, key=lambda one: (one.criterion > first.criterion + reach, one.near_bound, one.criterion))
+
+
+def _adds_little(one: Explanation, other: Explanation, plain: Refit, thresholds: Thresholds) -> bool:
+    """Whether one has the causes of another and some that explain no more than the models of those are off by."""
+    further = Counter(one.names) - Counter(other.names)
+    if not further or Counter(other.names) - Counter(one.names) or not other.causes:
+        return False
+    alike = {*other.names}.union(*(cause.behind for cause in other.causes))
+    off = max(model_error(name, alike, thresholds) for name in further)
+    explained, gained = plain.cost - other.model.cost, other.model.cost - one.model.cost
+    return gained <= off**2 * max(explained, 0.0)
 
 
 def _grown(one: Explanation, search: Search) -> list[Explanation]:
