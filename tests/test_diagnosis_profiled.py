@@ -1,5 +1,6 @@
 """Intervals of the parameters of causes where records hardly show one of them, against SciPy's filter."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from fits.diagnosis._joint_fit import leave_bounds
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import nothing, refit
 from fits.diagnosis._regression import regress
-from fits.diagnosis._select import Explanation, _best
+from fits.diagnosis._select import Cause, Explanation, _best
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._noise import Noise
 from microid import Driver
@@ -194,3 +195,19 @@ def test_of_explanations_that_are_not_told_apart_one_with_nothing_near_its_bound
     assert _best([none], plain, THRESHOLDS) is none
     assert _best([bound, free], plain, THRESHOLDS) is free
     assert _best([bound, none], plain, THRESHOLDS) is bound
+
+
+def test_causes_that_add_less_than_the_models_of_others_are_off_by_do_not_count():
+    _, _, one = at_slope(0.2, 0.2)
+    plain = replace(one, cost=20000.0)
+
+    def explained_by(cost, *names):
+        causes = [Cause(name, 50.0, 0.0, (), 1.0) for name in names]
+        return Explanation(tuple(causes), None, None, replace(one, cost=cost), (), None, cost, cost)
+
+    # Models are off by 6 % of 100 standard deviations, those of confusions by 60 %.
+    creep = explained_by(10000.0, "creep")
+    for name, most in (("slew_limit", 36.0), ("mount_relaxation", 3600.0)):
+        for gained, first in ((0.9 * most, creep), (1.1 * most, None)):
+            both = explained_by(10000.0 - gained, name, "creep")
+            assert _best([both, creep], plain, THRESHOLDS) is (first or both), name

@@ -1,6 +1,5 @@
 """Which effects the records need: a search over sets of causes, with refits, and a backward check."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -199,9 +198,9 @@ def _best(ends: Sequence[Explanation], plain: Refit, thresholds: Thresholds) -> 
 
 def _adds_little(one: Explanation, other: Explanation, plain: Refit, thresholds: Thresholds) -> bool:
     """Whether one has the causes of another and some that explain no more than the models of those are off by."""
-    further = Counter(one.names) - Counter(other.names)
-    if not further or Counter(other.names) - Counter(one.names) or not other.causes:
+    if not other.causes or not set(other.names) < set(one.names):
         return False
+    further = set(one.names) - set(other.names)
     alike = {*other.names}.union(*(cause.behind for cause in other.causes))
     off = max(model_error(name, alike, thresholds) for name in further)
     explained, gained = plain.cost - other.model.cost, other.model.cost - one.model.cost
