@@ -61,26 +61,28 @@ def test_causes_share_what_is_beyond_chance():
     assert not misfit(9.0, 39.0).unnamed(weak=True)[1]
 
 
-def named_beside(monkeypatch, parts, rest, harmful=()):
+def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=()):
     """Names that are kept where each cause explains a part of its own, in noise variances, and so much is left.
 
-    With each of those that are harmful, what was held out is predicted worse.
+    With each of those that are harmful, what was held out is predicted worse, and with those that are helpful better;
+    the strengths of those that are unsure are nearer to none than their standard deviation.
     """
 
     def cost(names):
         return rest + sum(part for name, part in parts.items() if name not in names)
 
     def model(names):
-        errors = np.ones(100) * (1 + sum(name in harmful for name in names))
-        return SimpleNamespace(cost=cost(names), change_um=errors)
+        errors = np.ones(100) * (1 + sum(name in harmful for name in names)) / (1 + sum(n in helpful for n in names))
+        strength_z = [0.5 if name in unsure else 9.0 for name in names]
+        return SimpleNamespace(cost=cost(names), change_um=errors, strength_z=strength_z.__getitem__)
 
-    def fewer(found, kept, _):
-        return model([found.causes[k].name for k in kept])
+    def without(found, name):
+        return model([cause.name for cause in found.causes if cause.name != name])
 
     def misfit_of(_, found, __):
         return misfit(cost(()) - found.model.cost, rest), None
 
-    monkeypatch.setattr(_misfit, "_refit_of", fewer)
+    monkeypatch.setattr(_misfit, "_without", without)
     monkeypatch.setattr(_misfit, "_in_noise", lambda found, _: found)
     monkeypatch.setattr(_misfit, "_misfit", misfit_of)
     causes = tuple(Cause(name, 9.0, 0.0, (), part) for name, part in parts.items())
@@ -93,7 +95,7 @@ def named_beside(monkeypatch, parts, rest, harmful=()):
     left_out = [words.split(" would")[0].split(" is not")[0].replace(" ", "_") for words in said]
     assert sorted(left_out) == sorted({*parts} - {*names})
     # The smallest first.
-    assert harmful or left_out == sorted(left_out, key=parts.__getitem__)
+    assert harmful or unsure or left_out == sorted(left_out, key=parts.__getitem__)
     return names
 
 
@@ -114,6 +116,16 @@ def test_what_predicts_worse_is_not_named_beside_others(monkeypatch):
     chance = 40 + 3 * 80**0.5
     assert named_beside(monkeypatch, parts, chance, ["friction"]) == ["creep", "mains_hum"]
     assert named_beside(monkeypatch, parts, chance, ["friction", "mains_hum"]) == ["creep"]
+
+
+def test_what_may_be_none_is_named_only_where_it_predicts(monkeypatch):
+    parts = {"creep": 8000.0, "second_resonance": 4000.0}
+    chance = 40 + 3 * 80**0.5
+    assert named_beside(monkeypatch, parts, chance, unsure=["second_resonance"]) == ["creep"]
+    beyond = {"unsure": ["second_resonance"], "helpful": ["second_resonance"]}
+    assert named_beside(monkeypatch, parts, chance, **beyond) == [*parts]
+    assert named_beside(monkeypatch, {"creep": 8000.0}, chance, unsure=["creep"]) == []
+    assert named_beside(monkeypatch, {"creep": 8000.0}, chance, unsure=["creep"], helpful=["creep"]) == ["creep"]
 
 
 def compared(before, after):

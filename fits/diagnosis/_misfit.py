@@ -1,6 +1,5 @@
 """What there is to be explained of a misfit, and which of the causes that were found are worth naming."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import explain_together, repeats_in, run_regressors
 from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
-from fits.stats._compare import is_worse
+from fits.stats._compare import improvement_z, is_worse
 from fits.stats._cycles import Cycles
 from fits.stats._noise import Noise
 from microid.effects import card_of
@@ -80,42 +79,50 @@ def worth_naming(
 ) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
     """Leave out causes that are not worth naming beside the others, the worst first.
 
-    They make predictions of what was held out worse, or explain a minor share of what the others leave: what explains
-    the rest may explain that. Returns what was found, the same in the given noise, and what is said of causes that
-    were left out.
+    Their strength may be none, they make predictions of what was held out worse, or they explain a minor share of
+    what the others leave: what explains the rest may explain that. Returns what was found, the same in the given
+    noise, and what is said of causes that were left out.
     """
     said: list[str] = []
-    thresholds = ready.reading.thresholds
     while True:
         told = _in_noise(found, noise)
         misfit, repeated = _misfit(ready, told, rounded)
-        names = [cause.name for cause in found.causes]
-        after = told.projector.held_out(told.model.change_um)
-        parts: dict[str, tuple[float, list[int]]] = {}
-        for name in {*names} if len({*names}) > 1 else ():
-            kept = [k for k, other in enumerate(names) if other != name]
-            fewer = _refit_of(told, kept, 2)
-            part = replace(misfit, explained=fewer.cost - told.model.cost).share
-            before = told.projector.held_out(fewer.change_um)
-            if is_worse(before, after, thresholds.worse_z, thresholds.model_error):
-                part = -float(np.sum(after**2) - np.sum(before**2))
-            if part < 0 or (not card_of(name).independent and part < thresholds.minor_share):
-                parts[name] = part, kept
-        if not parts:
+        doubts = [_doubt(told, name, misfit) for name in {cause.name: None for cause in found.causes}]
+        if not any(doubts):
             return found, told, misfit, repeated, said
-        name, (part, kept) = min(parts.items(), key=lambda item: item[1][0])
-        why = "what was held out is predicted worse with it than with the other causes alone"
-        if part >= 0:
-            share = f"{100 * part:.0f} % of what the other causes leave"
-            why = f"it would explain {share}, and what makes the rest may look like that"
+        _, name, why = min(filter(None, doubts))
         said.append(f"{name.replace('_', ' ')} is not named: {why}")
-        found = replace(found, causes=tuple(found.causes[k] for k in kept), model=_refit_of(found, kept, 3))
+        others = tuple(cause for cause in found.causes if cause.name != name)
+        found = replace(found, causes=others, model=_without(found, name))
 
 
-def _refit_of(found: Selection, kept: Sequence[int], rounds: int) -> Refit:
-    """Some of the laws fitted anew."""
-    laws, x = zip(*((found.model.laws[k], found.model.x[k]) for k in kept), strict=True)
-    return refit(found.bench, found.projector, laws, x, rounds)
+def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str] | None:
+    """Why a cause is not worth naming beside the others, and how much so, the least first; None where it is."""
+    thresholds, alone = misfit.thresholds, all(cause.name == name for cause in found.causes)
+    strength_z = max(found.model.strength_z(k) for k, cause in enumerate(found.causes) if cause.name == name)
+    if alone and strength_z >= 1:
+        return None
+    fewer = _without(found, name)
+    before, after = (found.projector.held_out(model.change_um) for model in (fewer, found.model))
+    if strength_z < 1 and improvement_z(before, after) < thresholds.worse_z:
+        return -np.inf, name, "its strength may be none, and nothing that was held out is predicted better with it"
+    if alone:
+        return None
+    if is_worse(before, after, thresholds.worse_z, thresholds.model_error):
+        worse = float(np.sum(after**2) - np.sum(before**2))
+        return -worse, name, "what was held out is predicted worse with it than with the other causes alone"
+    part = replace(misfit, explained=fewer.cost - found.model.cost).share
+    if card_of(name).independent or part >= thresholds.minor_share:
+        return None
+    share = f"{100 * part:.0f} % of what the other causes leave"
+    return part, name, f"it would explain {share}, and what makes the rest may look like that"
+
+
+def _without(found: Selection, name: str) -> Refit:
+    """The other laws fitted anew."""
+    kept = [k for k, cause in enumerate(found.causes) if cause.name != name]
+    laws, x = [found.model.laws[k] for k in kept], [found.model.x[k] for k in kept]
+    return refit(found.bench, found.projector, laws, x, 3) if kept else nothing(found.bench, found.projector)
 
 
 def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, Cycles]:

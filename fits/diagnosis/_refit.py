@@ -117,6 +117,16 @@ class Refit:
         strengths = [_strength(law, x, run, varied, covariance) for run in runs]
         return any(bool(np.any(np.abs(here) > least_z * sd)) for here, sd in strengths)
 
+    def strength_z(self, k: int) -> float:
+        """Standard deviations of a law's strength from zero, in the run that shows it best; infinite without one."""
+        law, x = self.laws[k], self.x[k]
+        if not law.form.strength:
+            return np.inf
+        own = slice(start := sum(other.size for other in self.laws[:k]), start + law.size)
+        covariance = self.covariance()[own, own]
+        each = [_strength(law, x, run, np.arange(law.size), covariance) for run in range(len(law.maps))]
+        return max(float(np.max(np.abs(here) / np.maximum(sd, 1e-300))) for here, sd in each)
+
     def possible(self, bench: Bench) -> bool:
         """Whether what went on in the last effect before the runs is no more than moves of the rig leave behind."""
         law, x = self.laws[-1], self.x[-1]
