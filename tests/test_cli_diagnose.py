@@ -63,6 +63,11 @@ def test_the_command_writes_everything(bench, rng):
     told = run("info", folder / "extended.json").stdout
     assert re.search(r"mechanics.natural_frequency_Hz +150.020 ± 0.034 +\(95 % 149.950..150.090\) +Hz", told)
     assert re.search(r"creep.gain_per_decade +0.01542 ± 0.00031 ", told)
+    bench.answer = diagnosis(rng, count=1)
+    assert run("diagnose", "run.csv", "--out", "seen").exit_code == 0
+    seen = run("info", bench.folder / "seen" / "baseline.json").stdout
+    assert f"written by 'microid diagnose' from {bench.answer.runs[0].source}, whose report" in seen
+    bench.answer = diagnosis(rng, count=0)
     assert "natural_frequency_Hz  149.80 ± 0.21" in run("info", folder / "baseline.json").stdout
     as_json = json.loads(run("diagnose", "run.csv", "--out", "a/b", "--json", "--quiet").stdout)
     assert json.loads((folder / "diagnosis.json").read_text()).items() <= as_json.items()

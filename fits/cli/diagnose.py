@@ -91,7 +91,8 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
             reached = [late.ranges_json(one) for one in diagnosis.details.get("reached", ())]
             runs = [{"offset_um": 0.0, "reached": one} for one in reached]
             known = late.strict(getattr(diagnosis, f"{which}_parameters"))
-            about = {"part_of": "diagnosis", "stage": which, "parameters": known, "runs": runs}
+            about: dict[str, Any] = {"part_of": "diagnosis", "stage": which, "parameters": known, "runs": runs}
+            about["sources"] = [run.source for run in diagnosis.runs]
             return late.model_text(stage, getattr(diagnosis, f"{which}_uncertainty"), about)
         except DataError as error:
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error

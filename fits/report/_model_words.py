@@ -53,7 +53,8 @@ def _known_of_fit(path: str, held: dict[str, Any]) -> str:
     try:
         if diagnosed:
             rows = parameter_lines(held["fit"].get("parameters", ()))
-            return "\n".join(["written by 'microid diagnose', whose report says how well it predicts", *rows])
+            seen = f" from {', '.join(held['fit']['sources'])}" if held["fit"].get("sources") else ""
+            return "\n".join([f"written by 'microid diagnose'{seen}, whose report says how well it predicts", *rows])
         return describe(held["fit"])
     except (LookupError, TypeError, ValueError, AttributeError):
         # The format does not say what a report holds, and the words are made for that of a fit.
