@@ -210,9 +210,10 @@ def test_commands_name_the_runs_and_those_held_out(rng):
     again = next_steps(found)[1][1]
     assert again == "microid diagnose slow.csv answer.csv --holdout 'a b.csv' --out again"
     assert [row[-1] for row in runs_read(runs)] == ["80 % fitted", "held out"]
-    assert "was looked at to choose" in partly_fitted(runs)
-    assert "was held out" in partly_fitted(runs[:1])
-    assert partly_fitted(runs[1:]) == ""
+    assert "was looked at to choose" in partly_fitted(runs, True)
+    assert "the end was held out" in partly_fitted(runs[:1], True)
+    assert "nothing was held out" in partly_fitted(runs[:1], False)
+    assert partly_fitted(runs[1:], True) == ""
     assert runs_read(runs)[0][1:4] == ("3000", number(np.ptp(first.time_s)), number(np.ptp(first.voltage_V)))
     silent = replace(found, verdict="unexplained", next_experiment=None)
     assert next_steps(silent)[-1][0].startswith("Record a run at another speed")

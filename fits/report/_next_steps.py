@@ -66,10 +66,12 @@ def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
     return rows
 
 
-def partly_fitted(runs: Sequence[RunView]) -> str:
+def partly_fitted(runs: Sequence[RunView], held_out: bool) -> str:
     """What became of the part of a run that was not fitted; nothing where there is none."""
     if not any(0 < run.fitted.mean() < 1 for run in runs if run.fitted.size):
         return ""
+    if not held_out:
+        return "What was not fitted are bad samples, and those that depend on an unknown past; nothing was held out."
     end = "was looked at to choose among causes" if any(not run.fitted.any() for run in runs) else "was held out"
     others = "bad samples, and those that depend on an unknown past, count for neither"
     return f"Of a run that is fitted in part the end {end}; {others}."
