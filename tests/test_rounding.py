@@ -6,6 +6,7 @@ from scipy.optimize import nnls
 
 from fits.loop._grid import non_negative
 from fits.loop._prior import Posterior, cholesky, definite
+from fits.loop._result import FitError
 
 
 def indefinite(rng, size=40, below=1e-11):
@@ -22,6 +23,12 @@ def test_a_precision_without_a_factor_gets_one_and_keeps_what_it_says(rng):
     raised, root = definite(precision)
     np.testing.assert_allclose(root @ root.T, raised, rtol=0, atol=1e-14)
     np.testing.assert_allclose(raised, precision, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("precision", [np.full((3, 3), np.nan), np.zeros((3, 3)), -np.eye(3)])
+def test_what_is_no_precision_is_refused(precision):
+    with pytest.raises(FitError):
+        definite(precision)
 
 
 def test_a_precision_with_a_factor_stays_as_it_is(rng):

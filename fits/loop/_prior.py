@@ -17,6 +17,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from fits.loop._moments import Moments, zero_dimensional
+from fits.loop._result import FitError, FitStatus
 from fits.stats._bfgs import minimise
 
 # Logarithms of the weights where the data say nothing: a density, of some strokes per squared range, whose slope is
@@ -208,12 +209,18 @@ def cholesky(matrix: Any) -> Any:
 
 
 def definite(precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A precision and its Cholesky factor, with the least eigenvalues raised where rounding left no factor."""
+    """A precision and its Cholesky factor, `(n, n)`, with the least eigenvalues raised where rounding left no factor.
+
+    A `FitError` where it is none: nothing in it, or numbers that are not finite.
+    """
     root = cholesky(precision)
     floor = _LEAST
     while not np.all(np.isfinite(root)):
         scale = np.sqrt(np.maximum(np.diagonal(precision), 1e-300))
-        value, vector = np.linalg.eigh(precision / scale / scale[:, None])
+        scaled = precision / scale / scale[:, None]
+        value, vector = np.linalg.eigh(scaled) if np.all(np.isfinite(scaled)) else (np.zeros(1), scaled)
+        if not value[-1] > 0:
+            raise FitError(FitStatus.NONFINITE)
         half = (scale[:, None] * vector) * np.sqrt(np.maximum(value, floor * value[-1]))
         precision = half @ half.T
         root, floor = cholesky(precision), 10 * floor

@@ -202,7 +202,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
 def _beside_lag(
     plan: Plan, problem: Problem, runs: list[Run], responses: Sequence[MeasuredResponse]
 ) -> Solved | None:
-    """Fit roughly with a lag of the reading at the end, which the stage lacks; None where the responses say nothing.
+    """Fit roughly with a lag of the reading at the end, which the stage lacks; None where that cannot be fitted.
 
     Without that lag a fit may run away from poles that the runs show beside it.
     """
@@ -212,7 +212,11 @@ def _beside_lag(
         lagged = stage.append(lagging.name, lagging(**{lagging.lag: jnp.asarray(lag_s)}))
         held = lagged.freeze(*(f"{lagging.name}.{field}" for field in lagging.history))
         starts.append(Problem.of(held, problem.chain.grid, problem.columns_um, problem.hyper, problem.stroke_um))
-    return _best_start(plan, starts, runs) if starts else None
+    try:
+        return _best_start(plan, starts, runs)
+    except FitError:
+        # There are no starts where the responses say nothing.
+        return None
 
 
 def _no_resonance(plan: Plan, name: str) -> str:
