@@ -17,6 +17,9 @@ from _command import OFF
 from _sweeps import small
 from PIL import Image
 
+from fits.io._file_set import usable_folder
+from fits.io._temporary import is_temporary
+
 ROOT = Path(__file__).parents[1]
 # As many as the study of each command kills; real commands take seconds each.
 MOMENTS = int(os.environ.get("MICROID_MOMENTS", 50))
@@ -247,3 +250,20 @@ def test_commands_are_killed_at_many_random_moments(bench, tmp_path, seed, name)
         elif path.suffix == ".parquet":
             assert content.equals(good[path])
     assert set(shown(tmp_path)) == set(good)
+
+
+@pytest.mark.parametrize("moment", ["rmdir", "exists"])
+def test_a_request_to_end_leaves_nothing_of_a_trial(tmp_path, monkeypatch, moment):
+    done, asked = getattr(Path, moment), []
+
+    def interrupted(path):
+        if is_temporary(path.name) and not asked:
+            asked.append(path)
+            raise KeyboardInterrupt
+        return done(path)
+
+    monkeypatch.setattr(Path, moment, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        usable_folder(tmp_path)
+    assert asked
+    assert list(tmp_path.iterdir()) == []

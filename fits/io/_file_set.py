@@ -45,7 +45,9 @@ def _unwritable(folder: Path) -> str:
     try:
         try:
             trial.mkdir()
+            trial.rmdir()
         finally:
+            # A request to end may come between the two; one that comes here finds nothing to remove.
             if trial.exists():
                 trial.rmdir()
     except OSError as error:
