@@ -1,7 +1,11 @@
-"""Hysteresis inside the mechanics as an effect, against adaptive integration."""
+"""Laws of Bouc and Wen as effects, inside the mechanics and of the voltage, against adaptive integration."""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from _models import random_model
+from scipy import integrate
 from test_effects_reference import BY_NAME, motion, through, wander
 
 import microid as m
@@ -26,3 +30,25 @@ def test_it_is_that_of_dahl_or_of_bouc_and_wen_on_the_mass(rng, gamma):
     for effect in effects:
         found = through(effect, 2e-4, push)
         np.testing.assert_allclose(found, truth, atol=0.04 * np.max(np.abs(truth - plain)))
+
+
+@pytest.mark.parametrize(("sigma", "exponent", "asymmetry"), [(1.0, 1.0, 0.0), (0.6, 1.7, -0.1), (0.9, 1.3, 0.12)])
+def test_a_state_of_bouc_and_wen_stays_behind_the_voltage(rng, sigma, exponent, asymmetry):
+    hysteresis, voltage = random_model(rng, 8), wander(rng, 300, 10, 90)
+    amplitude, length = 2.0, 20.0
+    effect = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 100, sigma, exponent, asymmetry)
+
+    def slope(z, way):
+        bent = 1 - sigma + sigma * np.sign(z) * way + asymmetry * (way + np.sign(z))
+        return (1 - abs(z) ** exponent * bent) / length
+
+    # Up from the lower end of the range to where the record begins, and along it.
+    lower = float(hysteresis.density.lower_V)
+    states = [-((1 - 2 * asymmetry) ** (-1 / exponent))]
+    for before, there in pairwise([lower, *voltage]):
+        way = np.sign(there - before)
+        found = integrate.solve_ivp(lambda _, z, way=way: slope(z[0], way), (before, there), states[-1:], rtol=1e-9)
+        states.append(found.y[0, -1])
+    given = through(hysteresis, 1e-3, voltage)
+    expected = given - amplitude * np.array(states[1:][: len(voltage)])
+    np.testing.assert_allclose(through(effect, 1e-3, voltage), expected, atol=1e-4 * amplitude)

@@ -76,6 +76,41 @@ def accommodation(operate: Operator, run: Situation, *, feedback_V_per_um: float
 
 @effect(
     "hysteresis",
+    "amplitude_um",
+    usual=0.2,
+    limit=10.0,
+    draws={"length_V": (5.0, 40.0)},
+    between={"length_V": POSITIVE},
+)
+def bouc_wen_hysteresis(
+    operate: Operator, run: Situation, *, amplitude_um: float, length_V: float = 20.0, bend: float = 1.5
+) -> Operator:
+    """A part that follows a curve of the voltage behind, on a way of `length_V`, and remembers no reversal for long.
+
+    It is Duhem's law with a curve `tanh(bend s)`, `s` going from -1 to 1 over the range: `dy/dv` is the distance from
+    the curve over `length_V`, up and down. `amplitude_um` is what the curve is multiplied with. The run starts where
+    it comes down from the upper end of the range.
+
+    Source: B. D. Coleman, M. L. Hodgdon, Int. J. Eng. Sci. 24 (1986) 897.
+    """
+
+    def beside(path_V: FloatArray) -> FloatArray:
+        middle_V, half_V = (run.rig.upper_V + run.rig.lower_V) / 2, (run.rig.upper_V - run.rig.lower_V) / 2
+        curve = np.tanh(bend * (path_V - middle_V) / half_V)
+        behind = np.empty(len(path_V))
+        behind[0] = curve[0] + bend * length_V / half_V * (1 - curve[0] ** 2)
+        way = np.maximum(np.abs(np.diff(path_V)) / length_V, 1e-12)
+        # The curve is a line over the voltage between two steps.
+        left, since = np.exp(-way), -np.expm1(-way) / way
+        for k, rise in enumerate(np.diff(curve)):
+            behind[k + 1] = curve[k + 1] + (behind[k] - curve[k]) * left[k] - rise * since[k]
+        return operate(path_V) + amplitude_um * behind
+
+    return beside
+
+
+@effect(
+    "hysteresis",
     "share",
     usual=0.05,
     limit=1.0,

@@ -188,13 +188,11 @@ def _ranked(
         if far and place < _NEAREST and not order[0].refit.is_noise(projector, thresholds.chance_z):
             ahead = left_ahead(order[0]) if ahead is None else ahead
             far = left_ahead(one) - ahead > near
-        # Its start is its own, however far it is from here.
-        ends = (
-            []
-            if order[0].refit.is_noise(projector, thresholds.chance_z)
-            else fit_from_poles(bench, projector, one.refit)
-        )
-        if place < _NEAREST and not far:
+        # The start of a lag is its own, however far it is from here; a lost resonance is noise that is heard in tune.
+        joint, is_lag = place < _NEAREST and not far, bool(one.refit.laws[-1].form.lag)
+        quiet = order[0].refit.is_noise(projector, thresholds.chance_z)
+        ends = fit_from_poles(bench, projector, one.refit) if (not quiet if is_lag else joint) else []
+        if joint:
             ends.append(fit_jointly(bench, projector, one.refit))
         if not ends:
             out.append(one)

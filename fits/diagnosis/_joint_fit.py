@@ -15,9 +15,12 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 from fits.diagnosis._thresholds import Thresholds
-from fits.stage._start import measure_response, start_lagging
+from fits.stage._run import named_parts
+from fits.stage._start import measure_response, start_lagging, start_stages
 from fits.stage._steps import hysteresis_alone
 from fits.stats._compare import improvement_z
+from microid import Mechanics, Stage
+from microid.effects import AbstractEffect
 
 # Simulations that differ by more than this, in all samples together, in noise, are not the same.
 _LARGEST_DIFFERENCE = 1.0
@@ -27,6 +30,8 @@ _LARGER, _BETTER = 1.5, 10.0
 _WEAKER = 0.8
 # Of places where a fit may begin so many are followed.
 _STARTS = 2
+# Logarithm of the ratio of two natural frequencies from which on they are not the same resonance.
+_ELSEWHERE = 0.3
 # Rounds in which the baseline follows that first.
 _FIRST = 2
 # Further rounds in which baseline and causes follow each other, at most.
@@ -68,30 +73,47 @@ def fit_jointly(bench: Bench, projector: Projector, model: Refit) -> State:
 
 
 def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[State]:
-    """Fit the last effect, a lag, jointly from poles that explain the responses of the runs together with it.
+    """Fit the last effect jointly from poles that explain the responses of the runs together with it.
 
-    A plain stage without the lag may have bent its own poles too far for a way back from there.
+    A plain stage without a lag may have bent its own poles too far for a way back from there. Any other effect is
+    fitted so only where the responses show a resonance far from that of the baseline, which has lost it.
     """
     baseline, law = bench.baseline, model.laws[-1]
-    if not (law.form.lag and baseline.dynamic):
+    if not baseline.dynamic:
         return []
     drives = hysteresis_alone(baseline.stage, baseline.runs)
-    before = replace(model, laws=model.laws[:-1], x=model.x[:-1])
-    others_um = [bench.respond_in(run, before.effects(run)) - plain for run, plain in enumerate(bench.plain)]
+    # A lag is found with the poles, any other effect is taken off the readings.
+    shown = replace(model, laws=model.laws[:-1], x=model.x[:-1]) if law.form.lag else model
+    others_um = [bench.respond_in(run, shown.effects(run)) - plain for run, plain in enumerate(bench.plain)]
     cleaned = [
         replace(run, record=replace(run.record, displacement_um=run.displacement_um - um))
         for run, um in zip(baseline.runs, others_um, strict=True)
     ]
+    responses, effects = list(map(measure_response, cleaned, drives)), law.effects(model.x[-1])
+    found = list[tuple[Stage, list[AbstractEffect]]]()
+    if law.form.lag:
+        for stage, lag_s in start_lagging(baseline.stage, responses):
+            found.append((stage, [replace(one, **{law.form.lag: jnp.asarray(lag_s)}) for one in effects]))
+    else:
+        away = (one for one in start_stages(baseline.stage, responses) if _resonates_elsewhere(one, baseline.stage))
+        found = [(stage, effects) for stage in away]
     starts = list[State]()
-    for stage, lag_s in start_lagging(baseline.stage, list(map(measure_response, cleaned, drives))):
+    for stage, begun in found:
         there = replace(baseline, z=np.asarray(baseline.chain.coordinates.of(stage)))
-        effects = [law.effect(model.x[-1], run) for run in range(len(baseline.runs))]
-        started = Law([replace(one, **{law.form.lag: jnp.asarray(lag_s)}) for one in effects], law.remembers)
-        laws, x = model.with_law(len(model.laws) - 1, started)
+        laws, x = model.with_law(len(model.laws) - 1, Law(begun, law.remembers))
         here = refit(bench, projector, laws, x, 0)
         state = _linearised_at(there, projector, here)
         starts.append((*state, refit(*state, laws, x, 4)))
     return [alternate(*state) for state in sorted(starts, key=lambda state: state[-1].cost)[:_STARTS]]
+
+
+def _resonates_elsewhere(stage: Stage, other: Stage) -> bool:
+    """Whether a natural frequency of one is far from that of another."""
+    pairs = zip(named_parts(stage, Mechanics), named_parts(other, Mechanics), strict=True)
+    return any(
+        abs(float(jnp.log(one.natural_frequency_Hz / two.natural_frequency_Hz))) > _ELSEWHERE
+        for (_, one), (_, two) in pairs
+    )
 
 
 def alternate(bench: Bench, projector: Projector, model: Refit, rounds: Sequence[int] = (4, 2)) -> State:
