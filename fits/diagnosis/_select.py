@@ -22,6 +22,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.stats._compare import improvement_z
 from fits.stats._score_test import standard_deviations
 from microid.effects import EFFECTS, card_of
 
@@ -237,14 +238,15 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )
         refused |= {s.name for s in leaders(open_, bench.baseline.dynamic)} - {rival.name for rival in fitted}
-        found = []
+        found, before = [], projector.held_out(model.change_um)
         for rival in [rival for rival in fitted if rival.end is not None]:
             refused.add(rival.name)
             end, drop = rival.end, model.cost - rival.refit.cost
             assert end is not None
             is_noise = end[-1].is_noise(end[1], thresholds.chance_z)
             alone = is_noise and not model.is_noise(projector, thresholds.chance_z)
-            if not end[-1].determined(thresholds.determined_z, False, alone):
+            predicts = improvement_z(before, rival.held_out) > thresholds.worse_z
+            if not (predicts or end[-1].determined(thresholds.determined_z, False, alone)):
                 continue
             # What it explains is lost where all is fitted together, or it explains less than its score promised.
             new = end[-1].laws[len(one.causes) :]
