@@ -65,7 +65,9 @@ def conclude(
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
     rounding_um = ready.faults.quantum_um / 12**0.5
     rounded = rounding_um**2 > thresholds.minor_share * noise_um**2
-    found, told, misfit, repeated, minor = worth_naming(ready, found, beside.noise, rounded)
+    # Beside causes a vibration is noise, however slow it is: what moves along with it by chance is no misfit.
+    noise = found.projector.noise if found.causes and beside.is_narrow(thresholds) else beside.noise
+    found, told, misfit, repeated, minor = worth_naming(ready, found, noise, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)

@@ -44,6 +44,10 @@ class Faults:
         """Whether there are enough spikes to be taken out."""
         return sum(int(s.sum()) for s in self.spikes) >= _FEWEST_SPIKES
 
+    def is_narrow(self, thresholds: Thresholds) -> bool:
+        """Whether there is a narrow band beyond chance that is no hum."""
+        return self.band.z > thresholds.strong_z and self.band.narrow and not self.band.mains
+
     def clean(self, records: Sequence[Record]) -> list[Record]:
         """Take the spikes out of records."""
         if not self.repaired:
@@ -167,7 +171,7 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
         jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
-    narrow = band.z > thresholds.strong_z and band.narrow and not (band.mains or cyclic)
+    narrow = faults.is_narrow(thresholds) and not cyclic
     # Up to its own size rounding makes lines, too, where a motion is even.
     if narrow and band.size_um**2 > max(thresholds.minor_share / 3 * total, step**2 / 12):
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"

@@ -100,7 +100,9 @@ def refuse_unidentifiable(
     fastest = max(solved.runs, key=lambda run: run.rate_Hz)
     mechanics = [(name, float(part.natural_frequency_Hz)) for name, part in modes]
     beyond = [(name, value) for name, value in mechanics if value > _HIGHEST_RESONANCE * fastest.rate_Hz]
-    seen = shows_poles(solved, drives)
+    # A ringing is seen beside a gain of another size, too, which only the first compares with none.
+    quiet = {name for name, _ in beyond} | {line.rpartition(".")[0] for line in lines}
+    seen = shows_poles(solved, drives) or any(name not in quiet for name, _ in mechanics)
     some = bool(unidentified) and (len(unidentified) == len(poles) or not fast)
     lacking = mechanics and (some or beyond) and named_parts(stage, Driver)
     if may_drop and seen and lacking and all(map(_resolved, solved.runs)):
