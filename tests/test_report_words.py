@@ -15,7 +15,7 @@ from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
 from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
-from microid.effects import EFFECTS
+from microid.effects import EFFECTS, Scales, extend
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
 
@@ -115,6 +115,31 @@ def test_columns_are_asked_for_that_the_stage_reads(rng):
         steps = " ".join(words for words, _ in next_steps(replace(made, extended=SimpleNamespace(parts=(form,)))))
         asked = "more columns in reference.csv: temperature_degC."
         assert (asked in steps) == (form.form == "temperature")
+
+
+def test_what_a_run_has_of_its_own_is_not_compensated(rng):
+    """A hum begins at any phase, so that its compensation may double it."""
+    made = diagnosis(rng)
+    forms = {form.name: form for form in reversed(EFFECTS)}
+    scene = Scales(0.0, 100.0, 1e3, 20.0, 10.0, 1e-3, 20.0, 2.0, 0.01)
+    drift, hum = (forms[name].probes(scene, None)[0][0] for name in ("thermal_drift", "mains_hum"))
+    none = replace(drift, rate_um_per_s=0 * drift.rate_um_per_s)
+    rest = made.runs[0], replace(made.runs[1], fitted=np.zeros_like(made.runs[1].fitted))
+    for part, runs, kept in (
+        (drift, made.runs, True),
+        (none, made.runs, False),
+        (drift, rest, False),
+        (hum, made.runs, False),
+    ):
+        found = replace(made, causes=(cause(part.name),), extended=extend(made.baseline, part), runs=runs)
+        (step, command), *_ = next_steps(found)
+        assert ("extended.json" in command) == kept
+        assert ("says nothing of the next" in step) != kept
+        both = replace(found, causes=(cause("creep"), *found.causes))
+        (step, command), *_ = next_steps(both)
+        assert "extended.json" in command
+        assert f"which has creep{f' and {plain(part.name)}' if kept else ';'}" in step
+        assert (f"what a run has of {plain(part.name)} says nothing" in step) != kept
 
 
 def test_the_temperature_is_spoken_of_where_there_was_one(rng):
