@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, cause, diagnosis
 
-from fits.diagnosis._result import Gain
+from fits.diagnosis._result import Gain, Test
 from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
@@ -260,3 +260,15 @@ def test_errors_of_a_fit_are_in_the_unit_that_they_ask_for():
     assert "12.17 nm" in row
     assert "1.5" in row.split("9 %")[1]
     assert row.endswith(" um")
+
+
+def test_what_explains_no_part_has_no_share_and_what_is_computed_is_not_measured(rng):
+    """Neighbours that agree by 37 standard deviations stood beside a share of 0 %."""
+    made = diagnosis(rng)
+    tests = Test("voltage", 30.0, 1e-9, 0.42, "It depends."), Test("whiteness", 37.0, 1e-9, 0.0, "Neighbours agree.")
+    driven = replace(made.gain, feedforward_before_um=0.2, feedforward_after_um=0.01)
+    page = text_of(replace(made, tests=tests, gain=driven)).replace("\N{NO-BREAK SPACE}", " ")
+    assert "42 % It depends" in page
+    assert f"{NONE} Neighbours agree" in page
+    assert "Predicted error under feedforward, rms, before → after 200 nm → 10.0 nm" in page
+    assert "computed, not measured" in page
