@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, cause, diagnosis
 
-from fits.diagnosis._result import Gain, Test
+from fits.diagnosis._conclude import not_named
+from fits.diagnosis._result import Gain
 from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
@@ -265,10 +266,30 @@ def test_errors_of_a_fit_are_in_the_unit_that_they_ask_for():
 def test_what_explains_no_part_has_no_share_and_what_is_computed_is_not_measured(rng):
     """Neighbours that agree by 37 standard deviations stood beside a share of 0 %."""
     made = diagnosis(rng)
-    tests = Test("voltage", 30.0, 1e-9, 0.42, "It depends."), Test("whiteness", 37.0, 1e-9, 0.0, "Neighbours agree.")
+    some = replace(made.tests[0], statistic=30.0, share=0.42, sentence="It depends.")
+    tests = some, replace(some, name="whiteness", share=0.0, sentence="Neighbours agree.")
     driven = replace(made.gain, feedforward_before_um=0.2, feedforward_after_um=0.01)
     page = text_of(replace(made, tests=tests, gain=driven)).replace("\N{NO-BREAK SPACE}", " ")
     assert "42 % It depends" in page
     assert f"{NONE} Neighbours agree" in page
     assert "Predicted error under feedforward, rms, before → after 200 nm → 10.0 nm" in page
     assert "computed, not measured" in page
+
+
+def test_what_only_the_readings_have_is_told_from_what_the_stage_has(rng):
+    """The voltage that makes a lagging reading follow makes the stage lead."""
+    made = diagnosis(rng)
+    for names, said in (
+        (("creep",), ""),
+        (("creep", "sensor_lowpass"), "Only the readings have sensor lowpass: they"),
+    ):
+        found = replace(made, causes=tuple(map(cause, names)))
+        (step, command), *_ = next_steps(found)
+        assert "extended.json" in command
+        assert (said in step) if said else ("readings" not in step)
+
+
+def test_one_suspect_is_not_spoken_of_as_several():
+    assert not_named(["creep"], "w").endswith("creep came nearest to what is left, but w: it is not named")
+    assert not_named(["creep", "load_change"], "w").startswith("creep, load change came nearest")
+    assert not_named(["creep", "load_change"], "w").endswith("none of them is named")

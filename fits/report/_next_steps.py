@@ -47,6 +47,10 @@ def _use(diagnosis: Diagnosis) -> tuple[str, str]:
         name, words = "extended.json", f"Compensate with the extended stage, which has {listed(lasting)}"
         if own:
             words += f"; {once}"
+        if read := [name for name in lasting if card_of(name).place in ("sensor", "time")]:
+            words += (
+                f". Only the readings have {listed(read)}: they follow the reference, and the stage is off by that"
+            )
         if not math.isfinite(after):
             words += ". Hold a run out first to learn what that is worth on new data"
     elif modelled:
