@@ -6,7 +6,7 @@ that the command's help does not wait for JAX and pandas.
 
 from typing import TYPE_CHECKING
 
-from fits.io._late import late as _late
+from microid._late import late as _late
 
 # fmt: off
 __all__ = [  # noqa: RUF022

@@ -1,3 +1,4 @@
+import json
 import shlex
 
 import numpy as np
@@ -145,3 +146,23 @@ def test_every_command_can_be_quiet_and_tell_more(good_csv):
     lines = run("info", "none.json", "--verbose").stderr.splitlines()
     assert "Traceback (most recent call last):" in lines
     assert lines[-1] == "none.json: no such file; check the name and the folder."
+
+
+def test_a_file_of_another_kind_is_told_by_what_it_is(tmp_path, good_csv):
+    model, answer = tmp_path / "model.json", tmp_path / "diagnosis.json"
+    assert run("fit", good_csv, "--levels", 8, "--out", model, "--quiet").exit_code == 0
+    refused(
+        run("inspect", model), "line 1: expected a header and rows of numbers, found JSON; name a table (microid info"
+    )
+    answer.write_text('{"schema": "microid.diagnosis/1"}')
+    refused(run("info", answer), "found the answer of a diagnosis; name baseline.json or extended.json beside it")
+
+
+def test_a_unit_that_is_guessed_is_said_to_be(tmp_path):
+    """Counts were taken for nm without a word."""
+    time_s, voltage_V, displacement_um = signals()
+    for name, unit, guessed in (("counts", "", True), ("counts", "[nm]", False), ("weg", "_um", False)):
+        path = tmp_path / "counts.csv"
+        path.write_text(f"time_s,voltage_V,{name}{unit}\n" + rows(time_s, voltage_V, 500 * displacement_um))
+        told = " ".join(json.loads(run("inspect", path, "--json").stdout)["remarks"])
+        assert (f"column '{name}' states no unit, and [nm] is guessed" in told) == guessed

@@ -10,7 +10,7 @@ from scipy import stats
 
 import fits
 from fits import Record
-from fits.diagnosis import _diagnose, _misfit
+from fits.diagnosis import _diagnose, _findings, _misfit
 from fits.diagnosis._effects import Law
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._misfit import Misfit
@@ -312,3 +312,24 @@ def test_of_runs_held_out_that_are_off_by_more_than_noise_it_is_said(asked):
     assert said(error=2.0)
     assert not said(error=1.1)
     assert not said(error=2.0, z=(9.0,))
+
+
+def test_the_class_of_a_cause_lists_none_that_is_named_beside_it(monkeypatch):
+    """A report had said sensor lowpass (or creep), and creep."""
+    forms = {form.name: form for form in EFFECTS}
+    rivals = {"sensor_lowpass": ("creep", "transport_delay"), "creep": ("sensor_lowpass",)}
+    causes = [
+        Cause(name, 9.0, 1e-9, tuple(SimpleNamespace(name=other) for other in others), 50.0)
+        for name, others in rivals.items()
+    ]
+    laws = [SimpleNamespace(form=forms[name], size=1, effects=lambda x: x) for name in rivals]
+    model = SimpleNamespace(covariance=lambda: np.eye(2), laws=laws, x=[np.ones(1), np.ones(1)])
+    bench = SimpleNamespace(respond=lambda _: [np.ones(3)], plain=[np.zeros(3)])
+    projector = SimpleNamespace(join=np.concatenate, off=lambda x: x, masks=[np.ones(3, bool)], count=3)
+    monkeypatch.setattr(_findings, "profile_likelihood", lambda *_: [])
+    monkeypatch.setattr(_findings, "_parameters", lambda *_: ())
+    beside = SimpleNamespace(bench=bench, projector=projector)
+    found = _findings.causes_of(
+        causes, model, beside, (1.0, 1.0), (), SimpleNamespace(noise=[SimpleNamespace(total_um=1.0)])
+    )
+    assert {one.name: one.also_consistent for one in found} == {"sensor_lowpass": ("transport_delay",), "creep": ()}

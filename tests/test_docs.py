@@ -22,6 +22,15 @@ def test_the_readme_is_short_and_tells_the_two_jobs_of_ci():
         assert text.count(f"<!-- ci: {mark} -->\n```bash\npython3 -m venv .venv && ") == 1
 
 
+def test_what_the_readme_found_stands_on_the_page_of_figures():
+    """Two of its rows were of earlier code, and other than those of the page."""
+    readme, figures = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/figures.md"))
+    table = re.search(r"\| what \| found \|\n(.*?)\n\n", readme, re.DOTALL)[1]
+    said = re.findall(r"\d+\.\d+|\d+ of \d+|\b\d{3}\b", table)
+    assert len(said) > 10
+    assert [one for one in said if not re.search(rf"(?<![\d.]){re.escape(one)}(?!\.?\d)", figures)] == []
+
+
 def test_the_citation_is_of_this_version_and_of_the_paper_of_the_readme():
     said, readme = ((ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "README.md"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

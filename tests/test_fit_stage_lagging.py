@@ -6,8 +6,10 @@ from _command import run
 from _wrong_records import said
 from scipy import signal
 
+import data_synth
 import fits
 import microid as m
+from fits.diagnosis import _baseline
 
 RATE_Hz, LAG_s, FINE = 10_000.0, 0.55e-3, 40
 
@@ -56,3 +58,33 @@ def test_a_linear_stage_is_fitted_to_a_run_with_hysteresis(tmp_path):
     found = fits.fit_stage([tmp_path / "fast.csv"], stage=stage.freeze("driver.gain", "mechanics.gain"))
     # Of that rig; that of a linear stage is of no rig, so that no interval is asked for.
     assert found["mechanics.natural_frequency_Hz"].value == pytest.approx(180.0, rel=0.03)
+
+
+@pytest.fixture(scope="module")
+def hidden_by_a_lag(tmp_path_factory):
+    """A slow and a fast run of a rig with a resonance of 134 Hz behind a sensor with a low-pass of 20 ms."""
+    sizes = {"slow_samples": 1500, "fast_samples": 3000, "temperature": False, "other_axis": False}
+    bench = data_synth.hidden(("sensor_lowpass",), seed=78, rms_per_noise=300.0, **sizes)
+    folder = tmp_path_factory.mktemp("lag")
+    data_synth.write(bench, folder)
+    return folder / "slow.csv", folder / "fast.csv"
+
+
+def test_a_lag_that_hides_the_resonance_is_thought_of(hidden_by_a_lag, tmp_path):
+    """The rate is 26 times the resonance: to sample faster would not help."""
+    told = run("fit", *hidden_by_a_lag, "--model", "stage", "--levels", 8, "--out", tmp_path / "stage.json")
+    assert told.exit_code == 2
+    assert (
+        "a lag of the readings may hide the resonance, too: microid diagnose fits the stage beside one" in told.stderr
+    )
+
+
+def test_a_diagnosis_does_not_advise_itself(hidden_by_a_lag, monkeypatch):
+    def refused(*_, **__):
+        fits.fit_stage(hidden_by_a_lag, levels=8)
+
+    monkeypatch.setattr(_baseline, "solve_stage", refused)
+    monkeypatch.setattr(_baseline, "_static", lambda *given: given[-2])
+    (remark,) = _baseline.fit_baseline(fits.read_runs(hidden_by_a_lag), [], 0.2, "negative", print)
+    assert "taken as quasi-static: fast.csv: sampled at" in remark
+    assert remark.endswith("sample at 5 times the resonance or more")

@@ -264,7 +264,7 @@ def test_a_file_and_columns_that_begin_with_a_minus_are_read_by_the_command_that
     table = np.c_[time_s, voltage_V, 0.3 * voltage_V + 0.01 * np.sin(40 * time_s)]
     np.savetxt("-run.csv", table, delimiter=",", header="t,-U,-x", comments="")
     told = json.loads(run("inspect", "./-run.csv", "--json").stdout)
-    assert told["remarks"] == []
+    assert [one for one in told["remarks"] if "states no unit" not in one] == []
     words = shlex.split(inspect_table("-run.csv").command)
     assert words[2] == "./-run.csv"
     found = fits.read_table(words[2], words[words.index("--columns") + 1])

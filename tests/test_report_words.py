@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, cause, diagnosis
 
+from fits.diagnosis._conclude import not_named
 from fits.diagnosis._result import Gain
 from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
 from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
-from microid.effects import EFFECTS
+from microid.effects import EFFECTS, Scales, extend
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
 
@@ -115,6 +116,31 @@ def test_columns_are_asked_for_that_the_stage_reads(rng):
         steps = " ".join(words for words, _ in next_steps(replace(made, extended=SimpleNamespace(parts=(form,)))))
         asked = "more columns in reference.csv: temperature_degC."
         assert (asked in steps) == (form.form == "temperature")
+
+
+def test_what_a_run_has_of_its_own_is_not_compensated(rng):
+    """A hum begins at any phase, so that its compensation may double it."""
+    made = diagnosis(rng)
+    forms = {form.name: form for form in reversed(EFFECTS)}
+    scene = Scales(0.0, 100.0, 1e3, 20.0, 10.0, 1e-3, 20.0, 2.0, 0.01)
+    drift, hum = (forms[name].probes(scene, None)[0][0] for name in ("thermal_drift", "mains_hum"))
+    none = replace(drift, rate_um_per_s=0 * drift.rate_um_per_s)
+    rest = made.runs[0], replace(made.runs[1], fitted=np.zeros_like(made.runs[1].fitted))
+    for part, runs, kept in (
+        (drift, made.runs, True),
+        (none, made.runs, False),
+        (drift, rest, False),
+        (hum, made.runs, False),
+    ):
+        found = replace(made, causes=(cause(part.name),), extended=extend(made.baseline, part), runs=runs)
+        (step, command), *_ = next_steps(found)
+        assert ("extended.json" in command) == kept
+        assert ("says nothing of the next" in step) != kept
+        both = replace(found, causes=(cause("creep"), *found.causes))
+        (step, command), *_ = next_steps(both)
+        assert "extended.json" in command
+        assert f"which has creep{f' and {plain(part.name)}' if kept else ';'}" in step
+        assert (f"what a run has of {plain(part.name)} says nothing" in step) != kept
 
 
 def test_the_temperature_is_spoken_of_where_there_was_one(rng):
@@ -235,3 +261,35 @@ def test_errors_of_a_fit_are_in_the_unit_that_they_ask_for():
     assert "12.17 nm" in row
     assert "1.5" in row.split("9 %")[1]
     assert row.endswith(" um")
+
+
+def test_what_explains_no_part_has_no_share_and_what_is_computed_is_not_measured(rng):
+    """Neighbours that agree by 37 standard deviations stood beside a share of 0 %."""
+    made = diagnosis(rng)
+    some = replace(made.tests[0], statistic=30.0, share=0.42, sentence="It depends.")
+    tests = some, replace(some, name="whiteness", share=0.0, sentence="Neighbours agree.")
+    driven = replace(made.gain, feedforward_before_um=0.2, feedforward_after_um=0.01)
+    page = text_of(replace(made, tests=tests, gain=driven)).replace("\N{NO-BREAK SPACE}", " ")
+    assert "42 % It depends" in page
+    assert f"{NONE} Neighbours agree" in page
+    assert "Predicted error under feedforward, rms, before → after 200 nm → 10.0 nm" in page
+    assert "computed, not measured" in page
+
+
+def test_what_only_the_readings_have_is_told_from_what_the_stage_has(rng):
+    """The voltage that makes a lagging reading follow makes the stage lead."""
+    made = diagnosis(rng)
+    for names, said in (
+        (("creep",), ""),
+        (("creep", "sensor_lowpass"), "Only the readings have sensor lowpass: they"),
+    ):
+        found = replace(made, causes=tuple(map(cause, names)))
+        (step, command), *_ = next_steps(found)
+        assert "extended.json" in command
+        assert (said in step) if said else ("readings" not in step)
+
+
+def test_one_suspect_is_not_spoken_of_as_several():
+    assert not_named(["creep"], "w").endswith("creep came nearest to what is left, but w: it is not named")
+    assert not_named(["creep", "load_change"], "w").startswith("creep, load change came nearest")
+    assert not_named(["creep", "load_change"], "w").endswith("none of them is named")

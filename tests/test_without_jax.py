@@ -1,5 +1,9 @@
 """`simulate` and static `compensate` of a hysteresis in NumPy: against JAX, against relays, and never with JAX."""
 
+import re
+import subprocess
+import sys
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -197,3 +201,15 @@ def test_a_model_that_is_not_there_is_refused_before_jax_is_imported(command, tm
     done = without_jax(command, tmp_path / "none.json", tmp_path / "x.csv", "--out", tmp_path / "y.csv", *more)
     assert done.returncode == 2
     assert "none.json" in done.stderr
+
+
+def test_the_command_of_python_does_without_jax_as_well(file):
+    """`python -m microid` imports the package before the command."""
+    asked = sys.executable, "-X", "importtime", "-m", "microid", "info", file[2]
+    done = subprocess.run(list(map(str, asked)), capture_output=True, text=True, check=False)
+    assert "fits.loop._report_words" in done.stderr
+    assert not re.search(r"\| +jax(lib)?\b", done.stderr)
+    named = (
+        "import microid, sys; assert 'jax' not in sys.modules; microid.Stage; microid.effects.EFFECTS; dir(microid)"
+    )
+    subprocess.run([sys.executable, "-c", named], check=True)

@@ -3,7 +3,7 @@
 
 from typing import TYPE_CHECKING
 
-from fits.io._late import late
+from microid._late import late
 
 if TYPE_CHECKING:
     from fits.control._compensate import compensate, static_equivalent

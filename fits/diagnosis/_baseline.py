@@ -15,7 +15,7 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
-from fits.stage._checks import OR_ALONE
+from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
@@ -147,7 +147,7 @@ def fit_baseline(
         found = solve_stage(*settings, accept_best=True, estimated=past, onward=near)
     except (DataError, FitError) as error:
         # That is what is done.
-        why = str(error).removesuffix(f", {OR_ALONE}")
+        why = str(error).removesuffix(BESIDE_A_LAG).removesuffix(f", {OR_ALONE}")
         remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {why}",)
         return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
     solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um

@@ -79,11 +79,10 @@ def conclude(
     # Weak evidence needs the support of what was held out.
     worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z, thresholds.model_error)
     if kept and (misfit.share < thresholds.explained_share or worse):
-        suspects = ", ".join(cause.name.replace("_", " ") for cause in kept)
         why = "what was held out is predicted worse with that"
         if misfit.share < thresholds.explained_share:
             why = f"that explains only {100 * misfit.share:.0f} % of it"
-        remarks.append(f"{suspects} came nearest to what is left, but {why}: none of them is named")
+        remarks.append(not_named([cause.name for cause in kept], why))
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
@@ -193,6 +192,12 @@ def conclude(
             ],
         },
     )
+
+
+def not_named(suspects: Sequence[str], why: str) -> str:
+    """Say which effects came nearest, and why they are not named."""
+    none = "it is not named" if len(suspects) == 1 else "none of them is named"
+    return f"{', '.join(suspects).replace('_', ' ')} came nearest to what is left, but {why}: {none}"
 
 
 def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:

@@ -55,7 +55,7 @@ def causes_of(
     weight: defaultdict[str, float] = defaultdict(float)
     bench, projector = beside.bench, beside.projector
     covariance, at = model.covariance(), 0
-    whole = max(sum(cause.drop for cause in causes), 1e-300)
+    whole, beside_it = max(sum(cause.drop for cause in causes), 1e-300), {cause.name for cause in causes}
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
         block = covariance[at : at + law.size, at : at + law.size]
         at += law.size
@@ -74,7 +74,8 @@ def causes_of(
             both = (*first.parameters, *more)
             found[cause.name] = replace(first, parameters=both, share_of_misfit=share, rms_um=rms_um)
             continue
-        rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS])
+        # What is named beside it is no alternative to it.
+        rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS] if rival.name not in beside_it)
         found[cause.name] = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
     forms: dict[Statistic, type[AbstractEffect]] = {form.statistic: form for form in EFFECTS if form.statistic}
     total = float(np.mean([n.total_um**2 for n in noise.noise]))

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.io._errors import AnyPath, DataError
+from fits.io._extras import need
 from fits.io._file_set import file_set
-from fits.io._late import need
 
 # Rows of a text that are made at a time.
 _ROWS = 65_536

@@ -161,6 +161,12 @@ def _unknown_units(table: Table, found: dict[str, FloatArray], sources: dict[str
                 f"column '{source.column}' is in '{unit}': write what 1 of it is in place of [{source.unit}], as in "
                 f"[0.5{source.unit}]"
             )
+    moved = sources.get("displacement_um")
+    if moved is not None and split_unit(moved.column)[1] is None and moved.scale == 1:
+        yield (
+            f"column '{moved.column}' states no unit, and [{moved.unit}] is guessed from its size: correct it, or "
+            f"write what 1 of it is, as in [0.5{moved.unit}]"
+        )
     taken = {source.column for source in sources.values()}
     free = [name for name in found if name not in taken and np.ptp(found[name]) > 0]
     if free and "voltage_V" in sources and "displacement_um" not in sources:

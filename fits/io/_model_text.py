@@ -19,6 +19,9 @@ def read_model_text(name: str) -> dict[str, Any]:
     content = parse_json(read_text(name, what, MOST_JSON_BYTES), name, what)
     schema = content.get("schema") if isinstance(content, dict) else None
     if not isinstance(schema, str) or not schema.startswith(_FAMILY):
+        if str(schema).startswith("microid.diagnosis/"):
+            what = "the answer of a diagnosis; name baseline.json or extended.json beside it"
+            raise DataError(f"{name}: expected a model, found {what}.")
         raise DataError(f"{name}: expected a model written by 'microid fit', found other JSON; name such a file.")
     if schema != SCHEMA:
         raise DataError(

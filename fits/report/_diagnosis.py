@@ -43,8 +43,10 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
         for one in asked
     ]
     tests = [
-        (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), percent(one.share), one.sentence)
+        (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), share, one.sentence)
         for one in diagnosis.tests
+        # What compares samples with one another explains no part of them.
+        for share in [percent(one.share) if one.share > 0 else _words.NONE]
     ]
     extremes = [
         (one.name, _span(one.low, one.high, one.unit), _span(one.lowest, one.highest, one.unit))
@@ -52,7 +54,7 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
     ]
     further = _arrow("Largest error", gain.heldout_max_before_um, gain.heldout_max_after_um)
     driven = gain.feedforward_before_um, gain.feedforward_after_um
-    further += _arrow("Error under feedforward, rms", *driven)
+    further += _arrow("Predicted error under feedforward, rms", *driven)
     template = _with_words().get_template("diagnosis.html")
     return unbroken(
         template.render(

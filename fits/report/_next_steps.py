@@ -9,7 +9,7 @@ import numpy as np
 
 from fits.diagnosis._result import Diagnosis, RunView
 from fits.report._words import NONE, estimate, length, listed, number, parameter_name, percent, plain, shown_unit
-from microid.effects import card_of
+from microid.effects import AbstractEffect, card_of
 
 
 def next_steps(diagnosis: Diagnosis) -> list[tuple[str, str]]:
@@ -35,9 +35,22 @@ def _use(diagnosis: Diagnosis) -> tuple[str, str]:
     """Which stage to go on with, and why."""
     gain, modelled = diagnosis.gain, [one.name for one in diagnosis.causes if not card_of(one.name).statistic]
     before, after = gain.heldout_rms_before_um, gain.heldout_rms_after_um
-    name = "baseline.json"
-    if modelled and not (after >= before):
-        name, words = "extended.json", f"Compensate with the extended stage, which has {listed(modelled)}"
+    own = [name for name in modelled if _is_own(diagnosis, name)]
+    lasting = [name for name in modelled if name not in own]
+    name, once = (
+        "baseline.json",
+        f"what a run has of {listed(own)} says nothing of the next, so see to that on the rig",
+    )
+    if modelled and not lasting:
+        words = f"Keep to the plain stage: {once}"
+    elif modelled and not (after >= before):
+        name, words = "extended.json", f"Compensate with the extended stage, which has {listed(lasting)}"
+        if own:
+            words += f"; {once}"
+        if read := [name for name in lasting if card_of(name).place in ("sensor", "time")]:
+            words += (
+                f". Only the readings have {listed(read)}: they follow the reference, and the stage is off by that"
+            )
         if not math.isfinite(after):
             words += ". Hold a run out first to learn what that is worth on new data"
     elif modelled:
@@ -53,6 +66,16 @@ def _use(diagnosis: Diagnosis) -> tuple[str, str]:
     else:
         words = "Use the plain stage: these records need no more"
     return f"{words}.", f"microid compensate {name} reference.csv --dynamic --out voltage.csv"
+
+
+def _is_own(diagnosis: Diagnosis, name: str) -> bool:
+    """Whether a run has an effect of its own, so that the extended stage foretells it in no other."""
+    parts = [part for part in diagnosis.extended.parts if isinstance(part, AbstractEffect) and part.name == name]
+    held = any(np.any(getattr(part, strength)) for part in parts for strength in part.strength)
+    alone = sum(bool(run.fitted.any()) for run in diagnosis.runs) == 1
+    # A hum begins at any phase, and one run does not say what it has in common with others.
+    form = parts[0] if parts else card_of(name)
+    return form.independent or (form.per_run and alone) or bool(parts and not held)
 
 
 def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:

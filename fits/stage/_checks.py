@@ -33,6 +33,7 @@ _USUAL_RANGES = {"natural_frequency_Hz": (3.0, 1e5), "time_constant_s": (0.0, 1.
 # Remedies.
 _BEYOND = "add a run with steps, a chirp or a multisine that goes beyond the resonance"
 _FASTER, OR_ALONE = "sample at 5 times the resonance or more", "or fit the hysteresis alone"
+BESIDE_A_LAG = "; a lag of the readings may hide the resonance, too: microid diagnose fits the stage beside one"
 
 
 def refuse_slopes(records: Sequence[Record]) -> None:
@@ -124,6 +125,7 @@ def refuse_unidentifiable(
             raise DataError(
                 f"{loud.record.source}: {why}: {noise[loudest]:.3g} um of it stay unexplained, "
                 f"{noise[loudest] / min(noise):.3g} times as much as of the quietest run; {remedy}, {OR_ALONE}"
+                f"{BESIDE_A_LAG}"
             )
         raise DataError(
             f"{sources}: no delay and no ringing is told from the hysteresis here, so these runs hold nothing "
@@ -134,6 +136,7 @@ def refuse_unidentifiable(
         raise DataError(
             f"{fastest.record.source}: sampled at {fastest.rate_Hz:.4g} Hz, and what moves there is explained best "
             f"by a resonance beyond half of that, so these runs do not show where it is: {_FASTER}, {OR_ALONE}"
+            f"{BESIDE_A_LAG}"
         )
     return None
 
@@ -151,6 +154,7 @@ def refuse_undersampled(stage: Stage, runs: Sequence[Run], left: Sequence[Misfit
                     f"{one.source}: sampled at {run.rate_Hz:.4g} Hz, which is too slow for what moves in it: "
                     f"{one.share_pct:.3g} % of its stroke stay unexplained, {one.times_noise:.3g} times the sensor's "
                     f"noise, and the resonance would lie {where}; {_FASTER}, {OR_ALONE}"
+                    f"{BESIDE_A_LAG}"
                 )
 
 

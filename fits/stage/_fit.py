@@ -20,7 +20,7 @@ from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, RunReport
 from fits.loop._run import Progress, Run, prepare_run
 from fits.loop._stepped import refuse_many_steps
-from fits.stage._checks import check_gains, implausible, refuse_undersampled
+from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import (
     gain_ahead,
@@ -103,7 +103,8 @@ def fit_stage(
     if undelayed is None or any(one.far for one in misfits(undelayed.solved.runs, undelayed.solved.residuals_um)):
         refuse_undersampled(solved.stage, runs, left)
     if undelayed is not None and (found.failure is not None or simplified):
-        raise DataError(f"{undelayed.words()}, and no fit was found with that: {REMEDY}")
+        beside = BESIDE_A_LAG if max(one.delay_s for one in undelayed.delays) > 0 else ""
+        raise DataError(f"{undelayed.words()}, and no fit was found with that: {REMEDY}{beside}")
     if found.failure is not None:
         raise found.failure
     gross = worst(left)

@@ -22,7 +22,7 @@ from typing import Any, TypedDict
 import msgspec
 import numpy as np
 
-from fits.io import _late
+from fits.io import _extras
 from fits.io._atomic import atomic_write_text
 from fits.io._errors import DataError
 from fits.io._file_set import DISK_TROUBLE, flush, usable_folder
@@ -278,7 +278,7 @@ def _sentences(folder: Path) -> Iterator[None]:
 
 def need(name: str) -> Any:
     """Import a package of the extras `sweep` and `cluster`; a `DataError` says what to run if it is not installed."""
-    return _late.need(name, "sweep,cluster" if name.partition(".")[0] == "distributed" else "sweep")
+    return _extras.need(name, "sweep,cluster" if name.partition(".")[0] == "distributed" else "sweep")
 
 
 @lru_cache(maxsize=1)

@@ -74,6 +74,9 @@ def _open_text(path: str, text: str) -> TextTable:
     separator, lines = _first_lines(text)
     if not lines:
         raise data_error(path, "expected a header and rows of numbers, found only comments; export again", "line 1")
+    if lines[0][2].lstrip().startswith("{"):
+        what = "expected a header and rows of numbers, found JSON; name a table (microid info shows a model file)"
+        raise data_error(path, what, f"line {lines[0][0]}")
     k, first, units = 0, 1, None
     if not separator:
         k, separator, first, units = _header(lines)

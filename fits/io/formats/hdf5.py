@@ -4,7 +4,7 @@ import io
 from collections.abc import Iterator
 from typing import Any
 
-from fits.io._late import need
+from fits.io._extras import need
 from fits.io._read_file import refuse_large
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register

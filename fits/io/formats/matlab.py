@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fits.io._late import need
+from fits.io._extras import need
 from fits.io._read_file import refuse_large
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register

@@ -2,7 +2,7 @@
 
 import io
 
-from fits.io._late import need
+from fits.io._extras import need
 from fits.io._read_file import refuse_large
 from fits.io._table import Table, of_frame
 from fits.io.formats._base import Format, register

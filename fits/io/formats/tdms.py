@@ -5,7 +5,7 @@ import logging
 from collections import defaultdict
 from dataclasses import replace
 
-from fits.io._late import need
+from fits.io._extras import need
 from fits.io._table import Found, Table, gathered
 from fits.io.formats._base import Format, register
 
