@@ -189,6 +189,10 @@ def test_an_extended_stage_has_what_all_runs_share():
         model = SimpleNamespace(laws=(law,), x=(law.start,))
         (shared,) = shared_effects(model, 2)
         np.testing.assert_allclose(shared.cosine_um, [expected, 0.1, 0.0], atol=1e-9)
+    # Of one run nobody knows whether the next has a hum of the same phase.
+    alone = Law(alike[:1])
+    (shared,) = shared_effects(SimpleNamespace(laws=(alone,), x=(alone.start,)), 1)
+    assert not np.any(shared.cosine_um)
     # What happened once does not happen again, and what went on before a run is no part of the rig.
     lost, creep = form("dropped_samples"), form("creep")
     once = Law([lost(jnp.asarray(1e-3), jnp.asarray(0.5))])

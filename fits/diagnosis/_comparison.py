@@ -86,9 +86,12 @@ def compare_rivals(
         scored = [other for other in scores if other.name == one.name]
         if found.cost - least < _PROMISING * (model.cost - least):
             found = relocate(bench, projector, found, first)
-        if not (_is_possible(projector, found, alone, thresholds) and has_occurred(bench, found)):
+        # From the poles of a plain stage a lag may shrink to none.
+        begins_elsewhere = bench.baseline.dynamic and bool(one.form.lag)
+        possible = _is_possible(projector, found, alone, thresholds) and has_occurred(bench, found)
+        if not (possible or begins_elsewhere):
             continue
-        stands_out = one.robust_z > thresholds.determined_z or not len(before)
+        stands_out = one.robust_z > thresholds.determined_z or not len(before) or begins_elsewhere
         if not (stands_out or improvement_z(before, projector.held_out(found.change_um)) >= thresholds.worse_z):
             continue
         most = first + laws if has_time() else 0
@@ -195,7 +198,8 @@ def _ranked(
         if joint:
             ends.append(fit_jointly(bench, projector, one.refit))
         if not ends:
-            out.append(one)
+            if not is_lag or one.refit.determined(thresholds.determined_z, False):
+                out.append(one)
             continue
         end = min(ends, key=lambda state: state[-1].cost)
         found = Rival.of(*end[1:])

@@ -84,8 +84,8 @@ def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_sha
         # What went on before one run says nothing of the next.
         nothing = {name: jnp.zeros(()) for name in law.form.history}
         each = [replace(law.effect(x, run), **nothing) for run in range(runs)]
-        if hasattr(each[0], "after_s"):
-            # What happened at one instant does not happen again.
+        if hasattr(each[0], "after_s") or (law.form.independent and runs == 1):
+            # What happened at one instant does not happen again, and a hum has another phase in the next run.
             found.append(replace(each[0], **{name: 0 * getattr(each[0], name) for name in law.form.strength}))
         elif law.form.per_run and law.each.any():
             found.append(replace(each[0], **{name: _common(each, name, spread) for name in law.form.strength}))

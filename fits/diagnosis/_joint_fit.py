@@ -30,8 +30,9 @@ _LARGER, _BETTER = 1.5, 10.0
 _WEAKER = 0.8
 # Of places where a fit may begin so many are followed.
 _STARTS = 2
-# Logarithm of the ratio of two natural frequencies from which on they are not the same resonance.
-_ELSEWHERE = 0.3
+# Logarithm of the ratio of two natural frequencies from which on they are not the same resonance, and the damping
+# ratio below which one shows clearly.
+_ELSEWHERE, _CLEAR = 0.3, 0.3
 # Rounds in which the baseline follows that first.
 _FIRST = 2
 # Further rounds in which baseline and causes follow each other, at most.
@@ -108,10 +109,11 @@ def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[Sta
 
 
 def _resonates_elsewhere(stage: Stage, other: Stage) -> bool:
-    """Whether a natural frequency of one is far from that of another."""
+    """Whether a clear resonance of one is far from any that another has there."""
     pairs = zip(named_parts(stage, Mechanics), named_parts(other, Mechanics), strict=True)
     return any(
-        abs(float(jnp.log(one.natural_frequency_Hz / two.natural_frequency_Hz))) > _ELSEWHERE
+        float(one.damping_ratio) < _CLEAR
+        and abs(float(jnp.log(one.natural_frequency_Hz / two.natural_frequency_Hz))) > _ELSEWHERE
         for (_, one), (_, two) in pairs
     )
 
