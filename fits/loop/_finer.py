@@ -34,7 +34,8 @@ def factor_with_plays(
     levels = finer * (EVIDENCE_LEVELS - 1) + 1
     # The levels of the smooth density are among those of the plays: on these it is exactly what it is on its own.
     grid, plays = grid_of(runs, levels), play_columns(levels)
-    data = gather(grid_of(runs, EVIDENCE_LEVELS), runs, 1, beside=Columns(branches_of(plays, levels), ridges))
+    beside = Columns(branches_of(plays, levels), plays.shape[1], ridges)
+    data = gather(grid_of(runs, EVIDENCE_LEVELS), runs, 1, beside=beside)
     moments, rough = data.total.scaled(1.0, stroke_um), roughness(EVIDENCE_LEVELS).with_plays(plays.shape[1])
     start = Hyper.of(*hyper.weights, hyper.log_variance + _MORE, _SOME)
     without = Hyper.of(*hyper.weights, hyper.log_variance, _NONE)
@@ -76,10 +77,11 @@ def play_columns(levels: int) -> np.ndarray:
     return plays[:, 1:-1]
 
 
-def ridges(high: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """What plays add on a rectangle, `(levels - 2, m)`; see `Columns`."""
+def ridges(high: np.ndarray, low: np.ndarray, out: np.ndarray) -> None:
+    """Write what plays add on a rectangle, `(levels - 2, m)`; see `Columns`."""
     n = len(high)
-    out = np.stack([np.einsum("im,im->m", high[k:], low[: n - k]) for k in range(1, n - 1)])
+    for k in range(1, n - 1):
+        np.einsum("im,im->m", high[k:], low[: n - k], out=out[k - 1])
     # What the nodes under the diagonal triangles take off beside the diagonal, see `rectangles`.
     out[0] -= np.einsum("im,im->m", high[:-1], low[1:])
-    return (n - 1) * out
+    out *= n - 1
