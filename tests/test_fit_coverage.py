@@ -75,7 +75,7 @@ def test_few_plays_widen_the_band_and_a_smooth_law_of_many_does_not(rng, law):
     run = prepare_run(record, (0.0, 100.0), "negative", 1 / 3)
     data, stroke_um = gather(grid_of([run], 24), [run]), float(np.ptp(true_um))
     solution = solve_grid(data, stroke_um, Hyper.start())
-    found = factor_with_plays(24, [run], solution.hyper, stroke_um)
+    found = factor_with_plays(data, solution.columns * stroke_um, [run], solution.hyper, stroke_um)
     plain_um = solution.posterior.factor() * stroke_um
 
     def sd_um(grid, factor_um):

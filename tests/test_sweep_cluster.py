@@ -82,6 +82,11 @@ def test_what_a_worker_cannot_read_refuses_that_worker(monkeypatch):
     assert "No space left" in refused
 
 
+def test_own_workers_need_not_return_memory_after_each_array():
+    with _cluster.connected("local:1") as client:
+        assert list(client.run(os.environ.get, "MALLOC_TRIM_THRESHOLD_").values()) == [None]
+
+
 @pytest.mark.study
 def test_a_killed_worker_and_a_killed_scheduler_lose_no_row(scheduler, tmp_path, monkeypatch, seed):
     first, address, worker = scheduler

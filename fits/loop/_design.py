@@ -89,12 +89,14 @@ def columns_of(model: Preisach) -> Float[Array, " D"]:
 class Columns:
     """Columns of the regression on some levels, as `Responses` computes them.
 
-    `table` are their branch polynomials, `(4, 2 (levels - 1), D)`; those that remember come first, and `products`
-    gives what they add on a rectangle, `(p, m)`, from the integrals of hat functions along its sides, `(levels, m)`.
+    `table` are their branch polynomials, `(4, 2 (levels - 1), D)`; so many as `remembering` come first that do, and
+    `products` writes what these add on rectangles, `(p, m)`, from integrals of hat functions along their sides, which
+    are `(levels, m)`.
     """
 
     table: np.ndarray
-    products: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    remembering: int
+    products: Callable[[np.ndarray, np.ndarray, np.ndarray], None]
 
     @property
     def levels(self) -> int:
@@ -155,35 +157,39 @@ class Responses:
         turn = _reach((np.clip(turns.values, lower, upper) - lower) * scale, nodes, np)
         up, before = turns.rising, turn[:, turns.anchor]
         sides = np.where(up, -turn, before), np.where(up, before, turn)
-        remembered = turns.add(columns.products(*sides).T.copy()).T.copy()
+        remembered = np.empty((columns.remembering, len(up)))
+        columns.products(*sides, remembered)
+        remembered = turns.add(remembered.T.copy()).T.copy()
 
         # Of a visit the second entry says where it is: it is nowhere near the ends.
         entry = lead + 4 * np.arange(len(mix))[:, None] + np.where(whole[:, None], 1, np.arange(4))
         x = (np.clip(path.values, lower, upper) - lower) * scale
-        cell, x = np.minimum(x[entry].astype(np.int64), n - 2), x[lead:].reshape(-1, 1, 4)
-        powers = np.vander((x - cell[:, :, None]).ravel(), 4, increasing=True).reshape(*mix.shape, 4)
-        way = np.einsum("gab,gabk->kga", mix, powers).reshape(4, -1)[:, order]
-        reach = np.moveaxis(_reach(x, nodes, np) @ mix.swapaxes(1, 2), 1, 0).reshape(n, -1)[:, order]
-        up, anchor = (each[entry.ravel()[order]] for each in (path.rising, at))
+        cell = np.minimum(x[entry].astype(np.int64), n - 2)
+        powers = np.vander((x[lead:].reshape(-1, 1, 4) - cell[:, :, None]).ravel(), 4, increasing=True)
+        way = np.einsum("gab,gabk->kga", mix, powers.reshape(*mix.shape, 4)).reshape(4, -1)[:, order]
+        cell, up, anchor = cell.ravel()[order], *(each[entry.ravel()[order]] for each in (path.rising, at))
+        # As `_reach` has it, of powers of the way through the cell.
+        reach, k = (nodes < cell) * way[0], np.arange(len(order))
+        reach[cell, k], reach[cell + 1, k] = way[0] / 2 + way[1] - way[2] / 2, way[2] / 2
+        reach[0] -= way[0] / 2
+        reach /= n - 1
         before = turn[:, anchor]
 
         self._columns, self._remembered, self._anchor = columns, remembered, anchor
-        self._way, self._branch = way, np.where(up, 0, n - 1) + cell.ravel()[order]
+        self._way, self._branch = way, np.where(up, 0, n - 1) + cell
         # A branch adds or takes off the rectangle between its anchor and the present voltage (see microid.Everett).
         self._sides = np.where(up, -reach, before), np.where(up, before, reach)
 
-    def of(self, which: slice) -> np.ndarray:
-        """Those of some mixtures, `(D, l)`."""
-        way, branch = self._way[:, which], self._branch[which]
-        out = np.empty((self._columns.size, len(branch)))
+    def write(self, which: slice, out: np.ndarray) -> None:
+        """Write those of some mixtures into an array, `(D, l)`."""
+        way, branch, size = self._way[:, which], self._branch[which], self._columns.remembering
+        high, low = self._sides
+        self._columns.products(high[:, which], low[:, which], out[:size])
+        out[:size] += self._remembered[:, self._anchor[which]] * way[0]
+        out[size:] = 0.0
         begins = np.flatnonzero(np.diff(branch, prepend=-1))
         for first, stop in pairwise([*begins, len(branch)]):
-            out[:, first:stop] = self._columns.table[:, branch[first]].T @ way[:, first:stop]
-        total = self._remembered[:, self._anchor[which]]
-        total *= way[0]
-        total += self._columns.products(*(side[:, which] for side in self._sides))
-        out[: len(total)] += total
-        return out
+            out[:, first:stop] += self._columns.table[:, branch[first]].T @ way[:, first:stop]
 
 
 def _reach(x: Any, nodes: Any, xp: Any) -> Any:
@@ -209,18 +215,17 @@ def _rectangles(high: Array, low: Array) -> Array:
     return high[:, i] * low[:, j] + ghost[:, after] + ghost[:, before] - ghost[:, beside]
 
 
-def rectangles(high: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """The same in NumPy, of `(N, m)`, shape `(p, m)`."""
+def rectangles(high: np.ndarray, low: np.ndarray, out: np.ndarray) -> None:
+    """The same in NumPy, of `(N, m)`, into an array, `(p, m)`."""
     n = len(high)
     first = np.arange(n) * np.arange(1, n + 1) // 2
-    corner, out = first + np.arange(n), np.empty((n * (n + 1) // 2, high.shape[1]))
+    corner = first + np.arange(n)
     for i in range(n):
         np.multiply(high[i], low[: i + 1], out=out[first[i] : first[i] + i + 1])
     ghost = high[:-1] * low[1:]
     out[corner[:-1]] += ghost
     out[corner[1:]] += ghost
     out[corner[1:] - 1] -= ghost
-    return out
 
 
 @lru_cache(maxsize=16)

@@ -113,7 +113,7 @@ def fit(
     believed = tried.data.grid, found.factor_um, mean.response @ found.factor_um
     if family == "grid" and found.correlation <= WHITE:  # elsewhere blocks say how smooth it is, not the evidence
         progress("looking for plays between the levels")
-        believed = factor_with_plays(tried.data.grid.levels, runs, tried.solution.hyper, stroke) or believed
+        believed = factor_with_plays(tried.data, columns, runs, tried.solution.hyper, stroke) or believed
     progress("checking the records")
     miss, told = check_loops(runs, prepare, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]

@@ -13,7 +13,6 @@ from fits.loop._moments import Data, blocks_of
 from fits.loop._prior import (
     Hyper,
     Posterior,
-    cholesky,
     effective,
     interpolation,
     inverse,
@@ -197,14 +196,13 @@ def _one_by_one(posterior: Posterior) -> tuple[np.ndarray, bool]:
 
 def _marginal(posterior: Posterior, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Covariance of all columns with the chosen ones, which ascend, and the posterior of those alone, scaled."""
-    rows = np.zeros((len(posterior.mean), len(which)))
+    rows = np.zeros((len(posterior.mean), len(which)), order="F")
     rows[which, np.arange(len(which))] = 1.0
-    spread = scipy.linalg.cho_solve((posterior.root, True), rows)
-    # With the chosen ones last, the end of the Cholesky factor is that of their marginal precision. The inverse of
-    # their covariance would be the same, but for rounding, which may leave it indefinite.
-    last = np.argsort(rows.sum(axis=1), kind="stable")
-    root = cholesky(posterior.precision[np.ix_(last, last)])[-len(which) :, -len(which) :]
-    precision = root @ root.T
+    half = scipy.linalg.solve_triangular(posterior.root, rows, lower=True, check_finite=False)
+    spread = scipy.linalg.solve_triangular(posterior.root, half, lower=True, trans=1, check_finite=False)
+    # Their covariance is `half.T @ half`: inverted as it is, rounding might leave it indefinite.
+    root, failed = scipy.linalg.lapack.dtrtri(np.linalg.qr(half, mode="r"))
+    precision = root @ root.T if not failed else np.full_like(root, np.nan)
     # Scaled so that every diagonal entry is 1: tolerances then mean standard deviations.
     scale = np.sqrt(np.diagonal(precision))
     return spread, precision / (scale[:, None] * scale[None, :]), posterior.mean[which] * scale, scale

@@ -247,7 +247,7 @@ def gather(
     """
     centred: list[list[Moments]] = []
     means = []
-    kinds = [Columns(branch_table(grid.levels), rectangles), *([] if beside is None else [beside])]
+    kinds = [Columns(branch_table(grid.levels), grid.weights, rectangles), *([] if beside is None else [beside])]
     levels_V, size = np.linspace(*grid.ends_V, kinds[-1].levels), sum(kind.size for kind in kinds)
     for run in runs:
         sums = _sums(kinds, run, _told(compressed(run, levels_V, pieces), run, progress))
@@ -269,6 +269,7 @@ def _told(parts: Iterator[Compressed], run: Run, progress: Callable[[str], None]
 def _sums(kinds: Sequence[Columns], run: Run, parts: Iterable[Compressed]) -> list[Moments]:
     """Moments per block, with the nuisance parameters at the end: those of a past that is estimated, and ones."""
     sums: list[Moments] = []
+    ends = np.cumsum([0, *(kind.size for kind in kinds)])
     before_V, length = run.extremes_V, max(_VALUES // (_SLOTS * kinds[-1].levels), 1)
     for groups in parts:
         for begin in range(0, len(groups.block), length):
@@ -281,13 +282,17 @@ def _sums(kinds: Sequence[Columns], run: Run, parts: Iterable[Compressed]) -> li
             place = (run.lower_V, run.upper_V), path, some.mix, some.whole, order
             responses = [Responses(kind, *place) for kind in kinds]
             target_um = some.target_um.ravel()[order]
-            sums = sums or [Moments.empty(sum(kind.size for kind in kinds) + len(nuisance))] * BLOCKS
+            sums = sums or [Moments.empty(ends[-1] + len(nuisance))] * BLOCKS
+            space = np.empty((len(sums[0].cross_um), _ROWS))
             for number, (first, stop) in enumerate(pairwise(bounds)):
                 energy, count = (each[some.block == number].sum() for each in (some.residue_um2, some.count))
                 gram, cross = np.zeros_like(sums[number].gram), np.zeros_like(sums[number].cross_um)
                 for k in range(first, stop, _ROWS):
                     which = slice(k, min(k + _ROWS, stop))
-                    rows = np.concatenate([*(one.of(which) for one in responses), nuisance[:, which]])
+                    rows = space[:, : which.stop - k]
+                    for one, (above, below) in zip(responses, pairwise(ends), strict=True):
+                        one.write(which, rows[above:below])
+                    rows[ends[-1] :] = nuisance[:, which]
                     # NumPy hands `a @ a.T` to BLAS as a rank-k update.
                     gram += rows @ rows.T
                     cross += rows @ target_um[which]

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from fits.loop._moments import Moments, zero_dimensional
 from fits.loop._result import FitError, FitStatus
+from fits.loop._surface import continued, spread
 from fits.stats._bfgs import minimise
 
 # Logarithms of the weights where the data say nothing: a density, of some strokes per squared range, whose slope is
@@ -153,23 +154,20 @@ def _squared(n: int, offsets: tuple[tuple[int, int], ...], factors: np.ndarray) 
 @lru_cache(maxsize=16)
 def interpolation(coarse: int, fine: int) -> np.ndarray:
     """Columns of a fine grid as read off a coarse one between its nodes, shape `(D_fine, D_coarse)`."""
+    return reread(np.eye(coarse * (coarse + 3) // 2), coarse, fine)
+
+
+def reread(columns: np.ndarray, coarse: int, fine: int) -> np.ndarray:
+    """Read columns of a coarse grid, `(D_coarse, k)`, off between its nodes as those of a fine one, `(D_fine, k)`."""
     position = np.linspace(0, coarse - 1, fine)
     cell = np.minimum(position.astype(np.int64), coarse - 2)
     part = position - cell
     line = np.zeros((fine, coarse))
     line[np.arange(fine), cell] = 1 - part
     line[np.arange(fine), cell + 1] += part
-    # Under the diagonal triangles the coarse grid goes on linearly: node (i, i + 1) = (i, i) + (i+1, i+1) - (i+1, i).
-    m = coarse * (coarse + 1) // 2
-    spread = np.zeros((coarse, coarse, m))
-    spread[np.tril_indices(coarse)] = np.eye(m)
-    k = np.arange(coarse - 1)
-    spread[k, k + 1] = spread[k, k] + spread[k + 1, k + 1] - spread[k + 1, k]
-    nodes = np.einsum("ai,bj,ijm->abm", line, line, spread, optimize=True)[np.tril_indices(fine)]
-    out = np.zeros((nodes.shape[0] + fine, m + coarse))
-    out[: nodes.shape[0], :m] = nodes
-    out[nodes.shape[0] :, m:] = line
-    return out
+    density, slope = np.split(columns, [coarse * (coarse + 1) // 2])
+    nodes = np.einsum("ai,bj,ijm->abm", line, line, continued(spread(density, coarse)), optimize=True)
+    return np.concatenate([nodes[np.tril_indices(fine)], line @ slope])
 
 
 class Posterior(eqx.Module):

@@ -1,6 +1,6 @@
 """Where the fit of a stage begins: poles read off a measured frequency response, so that nobody has to guess them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -153,12 +153,13 @@ def best_shifts(stage: Stage, response: MeasuredResponse, shifts_s: np.ndarray) 
     return [float(shifts_s[k]) for k in low[np.argsort(cost[low])]]
 
 
-def _distinct(points: Iterable[np.ndarray], apart: float) -> list[np.ndarray]:
-    kept: list[np.ndarray] = []
-    for point in points:
-        if all(np.max(np.abs(point - other)) > apart for other in kept):
-            kept.append(point)
-    return kept
+def _distinct(points: Sequence[np.ndarray] | np.ndarray, apart: float) -> list[np.ndarray]:
+    every, kept = np.array(points), list[int]()
+    near = np.max(np.abs(every[:, None] - every), axis=2) <= apart
+    for k, beside in enumerate(near):
+        if not beside[kept].any():
+            kept.append(k)
+    return [every[k] for k in kept]
 
 
 @dataclass(frozen=True)

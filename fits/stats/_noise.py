@@ -58,9 +58,12 @@ def repeated_square(place: np.ndarray, residual: np.ndarray, correlation: float)
     one, other = (np.concatenate(part) for part in zip(*((order[k:], order[:-k]) for k in range(1, 9)), strict=True))
     apart = np.abs(one - other) > 5 * correlation
     one, other = one[apart], other[apart]
-    closest = np.argsort(np.abs(place[one] - place[other]), kind="stable")[: len(place) // 2]
-    if len(closest) < 50:
+    count, away = min(len(one), len(place) // 2), np.abs(place[one] - place[other])
+    if count < 50:
         return 0.0
+    farthest = np.partition(away, count - 1)[count - 1]
+    # Of those as far away as the last that is taken, the first ones.
+    closest = np.concatenate([np.flatnonzero(away < farthest), np.flatnonzero(away == farthest)])[:count]
     products = centred[one[closest]] * centred[other[closest]]
     mean = float(products.mean())
     return mean if mean > float(products.std()) * (correlation / len(products)) ** 0.5 else 0.0

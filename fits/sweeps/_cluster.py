@@ -48,14 +48,15 @@ def connected(address: str) -> Iterator[Any]:
         try:
             where = address
             if count != address:
-                own = distributed.LocalCluster(
-                    n_workers=int(count),
-                    env={"NPROC": "1"},  # one thread of XLA in each worker, so that none is in another's way
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address="127.0.0.1:0",  # any free port: another cluster may have the usual one
-                    memory_limit=0,
-                )
+                with _memory_kept():
+                    own = distributed.LocalCluster(
+                        n_workers=int(count),
+                        env={"NPROC": "1"},  # one thread of XLA in each worker, so that none is in another's way
+                        threads_per_worker=1,
+                        processes=True,
+                        dashboard_address="127.0.0.1:0",  # any free port: another cluster may have the usual one
+                        memory_limit=0,
+                    )
                 where = stack.enter_context(own).scheduler_address
             client = stack.enter_context(distributed.Client(where, timeout=20, set_as_default=False))
         except (OSError, TimeoutError, ValueError) as error:
@@ -64,6 +65,13 @@ def connected(address: str) -> Iterator[Any]:
                 "tcp://host:8786, or local:2."
             ) from None
         yield client
+
+
+def _memory_kept() -> Any:
+    """Let workers keep memory for the next array: Dask has them return it each time, which costs a third of a fit."""
+    config = need("dask").config
+    name = "distributed.nanny.pre-spawn-environ"
+    return config.set({name: {k: v for k, v in config.get(name).items() if k != "MALLOC_TRIM_THRESHOLD_"}})
 
 
 def on_cluster(
