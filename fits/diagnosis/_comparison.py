@@ -191,10 +191,12 @@ def _ranked(
         if far and place < _NEAREST and not order[0].refit.is_noise(projector, thresholds.chance_z):
             ahead = left_ahead(order[0]) if ahead is None else ahead
             far = left_ahead(one) - ahead > near
-        # The start of a lag is its own, however far it is from here; a lost resonance is noise that is heard in tune.
+        # The start of a lag is its own, however far it is from here. A lost resonance is looked for beside the best,
+        # even where what it rings with passed for noise.
         joint, is_lag = place < _NEAREST and not far, bool(one.refit.laws[-1].form.lag)
         quiet = order[0].refit.is_noise(projector, thresholds.chance_z)
-        ends = fit_from_poles(bench, projector, one.refit) if (not quiet if is_lag else joint) else []
+        starts = not quiet if is_lag else place == 0
+        ends = fit_from_poles(bench, projector, one.refit) if starts else []
         if joint:
             ends.append(fit_jointly(bench, projector, one.refit))
         if not ends:

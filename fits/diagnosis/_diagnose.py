@@ -21,6 +21,7 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import refuse_repeats
 from fits.io._threads import one_thread
+from microid.effects import card_of
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
@@ -142,7 +143,9 @@ def diagnose(
     reading = Reading(records, aside, fraction, initial, thresholds)
     diagnosis = answer(reading)
     gain = diagnosis.gain
-    least_um2 = max(_UNLIKE * gain.noise_um**2, (1 - thresholds.minor_share) * gain.heldout_rms_before_um**2)
+    # A vibration is noise, too, and nothing that was held out would tell more of it.
+    heard_um2 = gain.noise_um**2 + sum(c.rms_um**2 for c in diagnosis.causes if card_of(c.name).statistic == "band")
+    least_um2 = max(_UNLIKE * heard_um2, (1 - thresholds.minor_share) * gain.heldout_rms_before_um**2)
     if gain.heldout_rms_after_um**2 > least_um2 and not aside and 2 * time.monotonic() - begin_s < end_s:
         progress("asking again with what was held out, which noise and causes do not explain")
         whole = answer(replace(reading, fraction=0.0), _ALL)
