@@ -194,13 +194,14 @@ def _ranked(
         # The start of a lag is its own, however far it is from here. A lost resonance is looked for beside the best,
         # even where what it rings with passed for noise.
         joint, is_lag = place < _NEAREST and not far, bool(one.refit.laws[-1].form.lag)
+        shown = not is_lag or one.refit.determined(thresholds.determined_z, False)
         quiet = order[0].refit.is_noise(projector, thresholds.chance_z)
         starts = not quiet if is_lag else place == 0
-        ends = fit_from_poles(bench, projector, one.refit) if starts else []
-        if joint:
+        ends = fit_from_poles(bench, projector, one.refit, not shown) if starts else []
+        if joint and shown:
             ends.append(fit_jointly(bench, projector, one.refit))
         if not ends:
-            if not is_lag or one.refit.determined(thresholds.determined_z, False):
+            if shown:
                 out.append(one)
             continue
         end = min(ends, key=lambda state: state[-1].cost)

@@ -73,11 +73,12 @@ def fit_jointly(bench: Bench, projector: Projector, model: Refit) -> State:
     return moved
 
 
-def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[State]:
+def fit_from_poles(bench: Bench, projector: Projector, model: Refit, better: bool = False) -> list[State]:
     """Fit the last effect jointly from poles that explain the responses of the runs together with it.
 
     A plain stage without a lag may have bent its own poles too far for a way back from there. Any other effect is
-    fitted so only where the responses show a resonance far from that of the baseline, which has lost it.
+    fitted so only where the responses show a resonance far from that of the baseline, which has lost it. Where it
+    must be `better`, a start is followed only if it leaves less than the model does.
     """
     baseline, law = bench.baseline, model.laws[-1]
     if not baseline.dynamic:
@@ -105,6 +106,7 @@ def fit_from_poles(bench: Bench, projector: Projector, model: Refit) -> list[Sta
         here = refit(bench, projector, laws, x, 0)
         state = _linearised_at(there, projector, here)
         starts.append((*state, refit(*state, laws, x, 4)))
+    starts = [state for state in starts if not better or state[-1].cost < model.cost - _BETTER]
     return [alternate(*state) for state in sorted(starts, key=lambda state: state[-1].cost)[:_STARTS]]
 
 
