@@ -63,4 +63,4 @@ else:
     _HOMES, __getattr__ = _late(__name__, __file__)
 
     def __dir__():
-        return sorted([*__all__, *(name for name, home in _HOMES.items() if home == __name__)])
+        return sorted({*globals(), *__all__, *(name for name, home in _HOMES.items() if home == __name__)})

@@ -187,10 +187,12 @@ def test_what_is_mistaken_for_the_best_is_compared_once_the_stage_has_followed(m
         return bench, SimpleNamespace(**data), end
 
     monkeypatch.setattr(_comparison, "fit_jointly", fit_jointly)
+    monkeypatch.setattr(_comparison, "fit_from_poles", lambda *_: [])
+    settled = {"is_noise": lambda *_: True, "determined": lambda *_: True}
     fitted = [
         Rival(
             name,
-            SimpleNamespace(laws=[SimpleNamespace(form=forms[name])], is_noise=lambda *_: True),
+            SimpleNamespace(laws=[SimpleNamespace(form=forms[name])], **settled),
             cost + np.linalg.norm(still),
             cost + np.linalg.norm(still),
             still,

@@ -264,7 +264,7 @@ def asked(monkeypatch):
         # Root mean squares of the errors in what was held out, in um, beside noise of 1 um.
         after_um = answer.get("error", 1.0)
         gain = Gain(answer.get("plain", after_um), after_um, noise_um=1.0)
-        causes = [SimpleNamespace(z=z) for z in answer.get("z", ())]
+        causes = [SimpleNamespace(z=z, name="creep", rms_um=0.0) for z in answer.get("z", ())]
         return Answer("effect_found" if causes else "no_effect", causes, gain, answer, ready.baseline.remarks)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
