@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete, lfilter
 
-from fits import Record, diagnose
+from fits import Record, diagnose, fit_stage
 
 NOISE_um, RATE_Hz, PARTS = 0.01, 100.0, 40
 TURNS_V = 0, 100, 0, 85, 15, 75, 25, 60, 40, 50, 0, 35, 15, 70, 45, 100, 60, 80, 20, 45, 0, 90, 30, 55, 0
@@ -38,3 +39,26 @@ def test_what_forgets_reversals_by_and_by_is_named_and_its_law_found(rng):
     assert value["length"] == pytest.approx(length_V / 100, rel=0.1)
     assert value["asymmetry"] == pytest.approx(asymmetry, abs=0.03)
     assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
+
+
+def test_a_resonance_shows_beside_small_loops_of_another_gain(rng):
+    """Such runs were said to hold no dynamics: a gain alone left as little of the fast one as the poles did."""
+    law = rng.uniform(20, 30), 0.8, 1.0, 0.0
+    resonance_Hz, damping, rate_Hz = rng.uniform(400, 600), rng.uniform(0.04, 0.08), 8000.0
+    way_V = np.r_[0, np.cumsum(np.abs(np.diff(TURNS_V)))]
+    slow_V = np.interp(np.arange(0, way_V[-1], 100 / RATE_Hz), way_V, TURNS_V)
+    time_s = np.arange(2500) / rate_Hz
+    waves = np.unique(np.geomspace(3, 0.6 * resonance_Hz * time_s[-1], 35).astype(int)) / time_s[-1]
+    swing_V = (np.cos(2 * np.pi * waves * time_s[:, None] + rng.uniform(0, 2 * np.pi, len(waves)))).sum(axis=1)
+    ramp = np.minimum(time_s / 0.05, 1)
+    fast_V = ramp * (50 + 20 * swing_V / np.abs(swing_V).max())
+    slow_um, fast_um = (0.2 * v - 1.6 * behind(v, *law) for v in (slow_V, fast_V))
+    natural = 2 * np.pi * resonance_Hz
+    over, under, _ = cont2discrete(([natural**2], [1, 2 * damping * natural, natural**2]), 1 / rate_Hz, "foh")
+    fast_um = lfilter(np.ravel(over), under, fast_um - fast_um[0]) + fast_um[0]
+    runs = [
+        Record(np.arange(len(v)) / rate, v, um + 0.003 * rng.standard_normal(len(um)), source=source)
+        for v, um, rate, source in ((slow_V, slow_um, RATE_Hz, "slow.csv"), (fast_V, fast_um, rate_Hz, "fast.csv"))
+    ]
+    found = {one.name: one.value for one in fit_stage(runs, initial="negative").parameters}
+    assert found["mechanics.natural_frequency_Hz"] == pytest.approx(resonance_Hz, rel=0.05)
