@@ -246,6 +246,7 @@ class Answer:
     gain: Gain
     of: dict
     remarks: tuple
+    unexplained_rms_um: float = 0.0
 
 
 @pytest.fixture
@@ -316,6 +317,13 @@ def test_of_runs_held_out_that_are_off_by_more_than_noise_it_is_said(asked):
     assert said(error=2.0)
     assert not said(error=1.1)
     assert not said(error=2.0, z=(9.0,))
+
+
+def test_of_a_part_held_out_that_is_off_by_more_than_noise_it_is_said(asked):
+    """A cause explained all but what a chirp reached at its end, and nothing told of that."""
+    for error, plain, expected in ((5.0, 20.0, True), (1.1, 20.0, False)):
+        remarks = asked({"error": error, "plain": plain, "z": (9.0,)})[0].remarks
+        assert any(f"held out is off by {error:.2g} times" in words for words in remarks) == expected
 
 
 def test_the_class_of_a_cause_lists_none_that_is_named_beside_it(monkeypatch):

@@ -236,9 +236,10 @@ def _gain(
 
 def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float) -> Faults:
     """Faults of samples and noise beside the causes and a rest, which may make what looked like a bad sample."""
+    # Where much is left, a small one would stand out of zero by that alone.
     spikes = tuple(
-        bad & (np.abs(one.after_um + height_um) > spike_z * float(np.hypot(noise.total_um, rest_um)))
-        for bad, height_um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
+        bad & (np.minimum(np.abs(one.after_um + um), np.abs(um)) > spike_z * float(np.hypot(noise.total_um, rest_um)))
+        for bad, um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
     )
     return replace(beside, spikes=spikes, heights_um=faults.heights_um)
 

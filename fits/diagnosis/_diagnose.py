@@ -35,6 +35,10 @@ _UNKNOWN = (
     "what was fitted is at the noise, and the runs held out are off by {:.2g} times it: where they go the hysteresis "
     "is not known, or something shows only there; to ask for it, diagnose them with the others"
 )
+_UNSEEN = (
+    "what was fitted is at the noise, and what was held out is off by {:.2g} times it: something shows only there, "
+    "as a resonance that a sweep reaches at its end; to ask for it, hold out nothing"
+)
 
 
 @one_thread
@@ -151,7 +155,7 @@ def diagnose(
         whole = answer(replace(reading, fraction=0.0), _ALL)
         if max((cause.z for cause in whole.causes), default=0.0) > thresholds.strong_z:
             return whole
-    if aside and diagnosis.verdict == "no_effect" and gain.heldout_rms_before_um**2 > _UNLIKE * gain.noise_um**2:
-        said = _UNKNOWN.format(gain.heldout_rms_before_um / gain.noise_um)
-        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, said))
+    off, said = gain.heldout_rms_after_um**2 / heard_um2, _UNKNOWN if aside else _UNSEEN
+    if off > _UNLIKE and (diagnosis.verdict == "no_effect" or not (aside or diagnosis.unexplained_rms_um > 0)):
+        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, said.format(off**0.5)))
     return diagnosis
