@@ -125,9 +125,12 @@ def test_what_a_run_has_of_its_own_is_not_compensated(rng):
     scene = Scales(0.0, 100.0, 1e3, 20.0, 10.0, 1e-3, 20.0, 2.0, 0.01)
     drift, hum = (forms[name].probes(scene, None)[0][0] for name in ("thermal_drift", "mains_hum"))
     none = replace(drift, rate_um_per_s=0 * drift.rate_um_per_s)
+    # A rail has no strength that could be none.
+    rail = forms["driver_saturation"].probes(scene, None)[0][0]
     rest = made.runs[0], replace(made.runs[1], fitted=np.zeros_like(made.runs[1].fitted))
     for part, runs, kept in (
         (drift, made.runs, True),
+        (rail, made.runs, True),
         (none, made.runs, False),
         (drift, rest, False),
         (hum, made.runs, False),

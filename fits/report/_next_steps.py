@@ -75,7 +75,7 @@ def _is_own(diagnosis: Diagnosis, name: str) -> bool:
     alone = sum(bool(run.fitted.any()) for run in diagnosis.runs) == 1
     # A hum begins at any phase, and one run does not say what it has in common with others.
     form = parts[0] if parts else card_of(name)
-    return form.independent or (form.per_run and alone) or bool(parts and not held)
+    return form.independent or (form.per_run and alone) or bool(parts and form.strength and not held)
 
 
 def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
