@@ -70,6 +70,26 @@ def test_a_lag_for_which_the_poles_bend_is_named_alone(rng):
 
 
 @pytest.mark.study
+def test_a_lag_that_hides_the_resonance_is_named(rng):
+    """It had been called a second resonance: the plain stage had two poles of its own in the place of the lag."""
+    driver_s, lag_s = rng.uniform(5e-4, 1.2e-3), rng.uniform(0.015, 0.025)
+    rig = (driver_s, lag_s), 2 * np.pi * rng.uniform(120, 150), rng.uniform(0.03, 0.06)
+    runs, aside = (
+        [
+            measured(rng, slow_V, SLOW_Hz, *rig, f"slow_{name}.csv"),
+            measured(rng, fast_V, FAST_Hz, *rig, f"fast_{name}.csv"),
+        ]
+        for name, (fast_V, slow_V) in (("fitted", fast_and_slow(rng, 300)), ("aside", fast_and_slow(rng, 300)))
+    )
+    found = diagnose(runs, holdout=aside)
+    print(found.summary())
+    assert found.causes[0].name == "sensor_lowpass"
+    value = next(one for one in found.causes[0].parameters if one.name == "time_constant_s")
+    assert abs(value.value - lag_s) < 0.05 * lag_s
+    assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
+
+
+@pytest.mark.study
 def test_a_gain_that_approaches_its_balance_neither_ages_nor_creeps(rng):
     """It had been called aging, with a creep of 40 ms."""
     rig = (rng.uniform(3e-4, 1e-3), 1e-9), 2 * np.pi * rng.uniform(160, 250), rng.uniform(0.03, 0.1)

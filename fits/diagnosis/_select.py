@@ -234,6 +234,9 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
         if not open_ or one.family.p(top / sigma) >= false_alarm or not search.has_time():
             break
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
+        if bench.baseline.dynamic:
+            # A lag that the poles have taken over shows nothing here, but its fit begins elsewhere.
+            open_ += [s for s in one.left if s.form.lag and s.name not in closed and s not in open_]
         fitted = compare_rivals(
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )
@@ -243,6 +246,9 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             refused.add(rival.name)
             end, drop = rival.end, model.cost - rival.refit.cost
             assert end is not None
+            if rival.form.lag:
+                # From the poles of the plain stage it may have come to none.
+                drop = max(drop, model.cost - end[-1].cost)
             is_noise = end[-1].is_noise(end[1], thresholds.chance_z)
             alone = is_noise and not model.is_noise(projector, thresholds.chance_z)
             predicts = improvement_z(before, rival.held_out) > thresholds.worse_z
