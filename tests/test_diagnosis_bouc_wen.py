@@ -36,7 +36,7 @@ def test_what_forgets_reversals_by_and_by_is_named_and_its_law_found(rng):
     (cause,) = found.causes
     assert cause.name == "bouc_wen_hysteresis"
     value = {one.name: one.value for one in cause.parameters}
-    assert value["length"] == pytest.approx(length_V / 100, rel=0.1)
+    assert value["length_share"] == pytest.approx(length_V / 100, rel=0.1)
     assert value["asymmetry"] == pytest.approx(asymmetry, abs=0.03)
     assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
 

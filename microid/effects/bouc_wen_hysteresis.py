@@ -37,7 +37,7 @@ class BoucWenHysteresis(AbstractEffect):
         The hysteresis `w`.
     amplitude_um
         `a`: `z` goes from about -1 to 1.
-    length
+    length_share
         `l` over the range of the voltage: on twice that way `z` has turned after a reversal. A shorter one than the
         lower bound is a clearance, as of `backlash`.
     range_V
@@ -70,7 +70,7 @@ class BoucWenHysteresis(AbstractEffect):
     )
     inner: AbstractPart
     amplitude_um: Float[Array, ""] = param(unit="um", scale=0.1)
-    length: Float[Array, ""] = param(unit="1", lower=0.05, upper=10.0)
+    length_share: Float[Array, ""] = param(unit="1", lower=0.05, upper=10.0)
     sigma: Float[Array, ""] = param(unit="1", lower=0.5, upper=5.0)
     exponent: Float[Array, ""] = param(unit="1", lower=1.0, upper=10.0)
     asymmetry: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.45, upper=0.45, default=0.0)
@@ -118,7 +118,7 @@ class BoucWenHysteresis(AbstractEffect):
             return 1 - power * (1 - self.sigma + self.sigma * side * way + self.asymmetry * (way + side))
 
         def visit(z: Array, move_V: Array) -> tuple[Array, Array]:
-            step, way = move_V / (self.length * self.range_V * substeps), jnp.sign(move_V)
+            step, way = move_V / (self.length_share * self.range_V * substeps), jnp.sign(move_V)
 
             def go(_: int, z: Array) -> Array:
                 k1 = slope(z, way)
