@@ -184,6 +184,8 @@ def check(function):
 sys.modules["checker"] = types.SimpleNamespace(check=check)
 with install_import_hook("microid", "checker.check"):
     import microid as m
+    # Names are imported on their first use.
+    used = [getattr(m, name) for name in dir(m)]
 import equinox as eqx, jax, jax.numpy as jnp, numpy as np
 from jaxtyping import TypeCheckError
 
