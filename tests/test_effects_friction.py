@@ -36,7 +36,7 @@ def test_it_is_that_of_dahl_or_of_bouc_and_wen_on_the_mass(rng, gamma):
 def test_a_state_of_bouc_and_wen_stays_behind_the_voltage(rng, sigma, exponent, asymmetry):
     hysteresis, voltage = random_model(rng, 8), wander(rng, 300, 10, 90)
     amplitude, length = 2.0, 20.0
-    effect = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 100, sigma, exponent, asymmetry)
+    effect = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 80, sigma, exponent, 80.0, asymmetry)
 
     def slope(z, way):
         bent = 1 - sigma + sigma * np.sign(z) * way + asymmetry * (way + np.sign(z))

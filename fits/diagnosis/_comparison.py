@@ -194,8 +194,8 @@ def _ranked(
         # The start of a lag is its own, however far it is from here. A lost resonance is looked for beside the best,
         # even where what it rings with passed for noise.
         joint, is_lag = place < _NEAREST and not far, bool(one.refit.laws[-1].form.lag)
-        shown = not is_lag or one.refit.determined(thresholds.determined_z, False)
         quiet = order[0].refit.is_noise(projector, thresholds.chance_z)
+        shown = not is_lag or one.refit.determined(thresholds.determined_z, False, quiet)
         starts = not quiet if is_lag else place == 0
         ends = fit_from_poles(bench, projector, one.refit, not shown) if starts else []
         if joint and shown:

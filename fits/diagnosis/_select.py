@@ -236,7 +236,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         if bench.baseline.dynamic:
             # A lag that the poles have taken over shows nothing here, but its fit begins elsewhere.
-            open_ += [s for s in one.left if s.form.lag and s.name not in closed and s not in open_]
+            open_ += [s for s in one.left if s.form.lag and s.name not in closed and s.z <= bars[s.form]]
         fitted = compare_rivals(
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )

@@ -36,16 +36,16 @@ class BoucWenHysteresis(AbstractEffect):
     inner
         The hysteresis `w`.
     amplitude_um
-        `a`: `z` goes from about -1 to 1.
+        `a`: `z` goes from about -1 to 1. Where it is negative, the part runs ahead of the voltage.
     length_share
         `l` over the range of the voltage: on twice that way `z` has turned after a reversal. A shorter one than the
         lower bound is a clearance, as of `backlash`.
-    range_V
-        That range, given, of the voltage behind the driver.
     sigma
         How much steeper `z` is after a reversal than at zero: a half where it is as steep, one in Dahl's law.
     exponent
         `n`, how sharply `z` bends towards its limits.
+    range_V
+        The range of the command, given.
     asymmetry
         `phi`, by which rising branches bend more than falling ones.
     before
@@ -73,9 +73,9 @@ class BoucWenHysteresis(AbstractEffect):
     length_share: Float[Array, ""] = param(unit="1", lower=0.05, upper=10.0)
     sigma: Float[Array, ""] = param(unit="1", lower=0.5, upper=5.0)
     exponent: Float[Array, ""] = param(unit="1", lower=1.0, upper=10.0)
+    range_V: Float[Array, ""] = array()
     asymmetry: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.45, upper=0.45, default=0.0)
     before: Float[Array, ""] = param(unit="1", lower=-2.0, upper=2.0, default=0.0)
-    range_V: Float[Array, ""] = array(default=100.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -85,7 +85,7 @@ class BoucWenHysteresis(AbstractEffect):
         size, sigma, exponent = (jnp.asarray(x) for x in (0.01 * scales.stroke_um, 0.75, 1.4))
         range_V = jnp.asarray(scales.upper_V - scales.lower_V)
         grid = _decades(0.06, 1.0, 2)
-        return tuple((cls(inner, size, jnp.asarray(x), sigma, exponent, range_V=range_V),) for x in grid)
+        return tuple((cls(inner, size, jnp.asarray(x), sigma, exponent, range_V),) for x in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Answer as the hysteresis does, less what stays behind."""
