@@ -22,6 +22,7 @@ from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._misfit import worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
+from fits.diagnosis._refit import Refit
 from fits.diagnosis._residual_tests import (
     explain,
     further_regressors,
@@ -117,6 +118,7 @@ def conclude(
             f"{', '.join(sorted(bound))}: a parameter ended at the bound of what such an effect may have, so that "
             "something else that looks alike may be there instead"
         )
+    remarks += _before_the_runs(model, thresholds.determined_z)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)
@@ -198,6 +200,16 @@ def not_named(suspects: Sequence[str], why: str) -> str:
     """Say which effects came nearest, and why they are not named."""
     none = "it is not named" if len(suspects) == 1 else "none of them is named"
     return f"{', '.join(suspects).replace('_', ' ')} came nearest to what is left, but {why}: {none}"
+
+
+def _before_the_runs(model: Refit, least_z: float) -> list[str]:
+    """Say of which causes only what moves before the runs left behind shows, and no strength in the runs."""
+    return [
+        f"{law.form.name.replace('_', ' ')}: what shows is what moves before the record have left behind; as the rig "
+        "moved in the record itself, it may have none"
+        for k, law in enumerate(model.laws)
+        if law.remembers and model.strength_z(k) < least_z
+    ]
 
 
 def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:

@@ -6,6 +6,7 @@ import io
 import os
 import pickle
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,9 +21,6 @@ import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
-
-from fits.io._atomic import atomic_path
-from fits.io._errors import DataError
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -158,9 +156,11 @@ def _write(file: Path, found: tuple[Any, Any, Any]) -> None:
     try:
         content = pickle.dumps(found)
         file.parent.mkdir(mode=0o700, exist_ok=True)
-        with atomic_path(file) as temporary:
-            temporary.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
-    except (OSError, DataError, pickle.PicklingError, AttributeError, TypeError):
+        # No output of a command: it need not be on the disk, nor be logged. `_read` knows what was cut off.
+        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as temporary:
+            temporary.write(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+        os.replace(temporary.name, file)
+    except (OSError, pickle.PicklingError, AttributeError, TypeError):
         # It is made anew in the next call.
         return
 
