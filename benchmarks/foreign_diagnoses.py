@@ -61,11 +61,11 @@ def scores(hidden: str, law: str, noise: str, seed: int, number: int) -> tuple[s
     words = f"{found.verdict} {','.join(cause.name for cause in found.causes)}"
     if kept[1] is None:
         return f"{words} no band", []
-    first, used = fits.predict(*kept, records[0]), slice(0, round(0.8 * len(records[0])))
+    first, used = fits.predict(kept[0], records[0], uncertainty=kept[1]), slice(0, round(0.8 * len(records[0])))
     offset_um = np.mean((records[0].displacement_um - first.displacement_um)[used])
     out = []
     for record, true_um in zip(records[2:], truths_um[2:], strict=True):
-        ahead = fits.predict(*kept, record)
+        ahead = fits.predict(kept[0], record, uncertainty=kept[1])
         off_um, sd_um = true_um - ahead.displacement_um - offset_um, ahead.displacement_sd_um
         rms_um = float(np.sqrt(np.mean(off_um**2)))
         covered = float(np.mean(np.abs(off_um) < 1.96 * sd_um))

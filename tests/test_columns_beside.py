@@ -77,7 +77,7 @@ def test_a_stage_with_an_effect_of_a_column_asks_for_it(rng):
     )
     stage = extend(plain, coupling(jnp.asarray(0.01)))
     given = record(rng, y_um=np.sin(np.arange(400) / 7))
-    moved = fits.predict(stage, None, given).displacement_um - fits.predict(plain, None, given).displacement_um
+    moved = fits.predict(stage, given).displacement_um - fits.predict(plain, given).displacement_um
     assert np.ptp(moved) > 1e-3
     with pytest.raises(fits.DataError, match="other_um"):
-        fits.predict(stage, None, record(rng))
+        fits.predict(stage, record(rng))

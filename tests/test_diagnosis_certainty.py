@@ -40,7 +40,7 @@ def test_the_band_is_the_spread_of_fits_to_noisy_data(rng, monkeypatch):
     band = certain.predictions(stage, [np.zeros(900)] * 2)
     time_s = np.linspace(0.0, 1.0, 900)
     program = Record(time_s, 50 + 45 * np.sin(2 * np.pi * (2 + 5 * time_s) * time_s), time_s, source="program")
-    found = predict(stage, band, program).displacement_sd_um
+    found = predict(stage, program, uncertainty=band).displacement_sd_um
 
     counts = len(baseline.columns_um), len(baseline.z), law.size
     new = prepare_run(program, RANGE_V, "negative", 0.0, STRIDE)
@@ -94,7 +94,7 @@ def test_the_band_of_a_plain_stage_owns_up_to_few_plays(rng):
         stage = baseline.stage.with_substeps(max(run.samples.stride for run in baseline.fine))
         left_um = [one - one.mean() for one in regression.residuals]
         band = Certainty(projector, nothing(bench, projector), bench, baseline).predictions(stage, left_um)
-        first, ahead = (predict(stage, band, record) for record in (records[0], records[2]))
+        first, ahead = (predict(stage, record, uncertainty=band) for record in (records[0], records[2]))
         # A stage has no offset of its own: it is that of the first run.
         offset_um = np.mean(records[0].displacement_um - first.displacement_um)
         off_um = true_um[2] - ahead.displacement_um - offset_um

@@ -182,7 +182,7 @@ def test_predictions_of_extended_stages_are_those_of_jax(hold, even, rng, tmp_pa
     stage, uncertainty = extended(rng, hold=hold, substeps=3)
     save_model(tmp_path / "s.json", stage, uncertainty, {})
     plain, record = plain_model(read_model_text(str(tmp_path / "s.json"))), program(rng, stage, even)
-    found, expected = plain.predict(record, "negative"), predict(stage, uncertainty, record)
+    found, expected = plain.predict(record, "negative"), predict(stage, record, uncertainty=uncertainty)
     exact = {"rtol": 0, "atol": EXACT * stroke_um(stage["hysteresis"]) * float(stage["mechanics"].gain)}
     np.testing.assert_allclose(found.displacement_um, expected.displacement_um, **exact)
     np.testing.assert_allclose(found.displacement_sd_um, expected.displacement_sd_um, rtol=1e-10)

@@ -52,7 +52,7 @@ def test_prediction_is_the_model_and_its_band_covers_the_truth(result, bench):
     prediction = result.predict(heldout, initial="negative")
     plain = result.model(jnp.asarray(heldout.voltage_V))
     np.testing.assert_allclose(prediction.displacement_um, plain, rtol=0, atol=1e-9)
-    unsure = fits.predict(result.model, None, heldout)
+    unsure = fits.predict(result.model, heldout)
     np.testing.assert_allclose(unsure.displacement_um, plain, rtol=0, atol=1e-9)
     assert np.all(np.isnan(unsure.displacement_sd_um))
     truth = bench.records[1].true_displacement_um

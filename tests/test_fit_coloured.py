@@ -30,7 +30,7 @@ def test_wandering_noise_leaves_the_density_as_rough_as_it_is(rng, memory):
     noise_um = lfilter([(1 - memory**2) ** 0.5], [1, -memory], rng.standard_normal(SAMPLES + 500))[500:] * NOISE_um
     record = fits.Record(np.arange(SAMPLES) / 50, voltage_V, true_um + noise_um, source="wandering.csv")
     found = fits.fit([record], holdout=0.0, initial="negative")
-    predicted = fits.predict(found.model, found.uncertainty, record, initial="negative")
+    predicted = fits.predict(found.model, record, initial="negative", uncertainty=found.uncertainty)
     off_um = predicted.displacement_um - true_um
     off_um -= off_um.mean()
     assert np.std(off_um) < 1.5 * NOISE_um

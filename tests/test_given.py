@@ -140,9 +140,9 @@ def test_programs_and_references_are_given_as_runs_are(tmp_path):
     ends = float(law.density.lower_V), float(law.density.upper_V)
     frame = pd.DataFrame({"time_s": TIME_s, "voltage_V": np.interp(VOLTAGE_V, [0, 100], ends)})
     frame.to_csv(tmp_path / "program.csv", index=False)
-    played = fits.predict(law, None, fits.Record(TIME_s, frame["voltage_V"], None)).displacement_um
+    played = fits.predict(law, fits.Record(TIME_s, frame["voltage_V"], None)).displacement_um
     for program in (frame, tmp_path / "program.csv", dict(frame)):
-        np.testing.assert_allclose(fits.predict(law, None, program).displacement_um, played, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(fits.predict(law, program).displacement_um, played, rtol=0, atol=1e-12)
     wanted = {"time_s": TIME_s, "displacement_um": played}
     found = fits.compensate(law, wanted, clip=True)
     np.testing.assert_allclose(found.displacement_um, played, atol=1e-6)
@@ -153,21 +153,19 @@ def test_a_model_is_given_as_itself_as_a_fit_or_by_the_name_of_its_file(tmp_path
     fits.save_model(tmp_path / "m.json", found.model, found.uncertainty, fits.fit_report(found))
     wanted = {"time_s": TIME_s, "displacement_um": found.runs[0].offset_um + 5 + 3 * np.sin(TIME_s)}
     voltage_V = fits.compensate(found.model, wanted, clip=True).voltage_V
-    alone = fits.predict(found.model, found.uncertainty, FRAME)
+    alone = fits.predict(found.model, FRAME, uncertainty=found.uncertainty)
     for model in (found.model, found, fits.load_model(tmp_path / "m.json"), tmp_path / "m.json"):
         np.testing.assert_array_equal(fits.compensate(model, wanted, clip=True).voltage_V, voltage_V)
         assert fits.export_c(model, tmp_path / "c")[0].exists()
         if model is not found.model:
-            np.testing.assert_array_equal(
-                fits.predict(model, None, FRAME).displacement_sd_um, alone.displacement_sd_um
-            )
-    first, *others = fits.draw_plants(found, None, 3)
+            np.testing.assert_array_equal(fits.predict(model, FRAME).displacement_sd_um, alone.displacement_sd_um)
+    first, *others = fits.draw_plants(found, 3)
     assert len(others) == 2
     assert fits.relay_start(tmp_path / "m.json", 1e-3) == fits.relay_start([first], 1e-3)
     with pytest.raises(fits.DataError, match="expected a Preisach model or a stage"):
         fits.relay_start([first, 3], 1e-3)
     for model, words in ((tmp_path / "none.json", "none.json: no such file"), (3, "found a int")):
-        for use in (lambda one: fits.compensate(one, wanted), lambda one: fits.predict(one, None, FRAME)):
+        for use in (lambda one: fits.compensate(one, wanted), lambda one: fits.predict(one, FRAME)):
             with pytest.raises(fits.DataError, match=words):
                 use(model)
 
@@ -212,7 +210,7 @@ def test_a_program_without_samples_is_refused():
     empty = fits.Record(np.zeros(0), np.zeros(0), None, source="none.csv")
     model = random_model(np.random.default_rng(1))
     with pytest.raises(fits.DataError, match=r"none\.csv: there are no samples"):
-        fits.predict(model, None, empty)
+        fits.predict(model, empty)
     with pytest.raises(fits.DataError, match="the reference: there are no samples"):
         fits.compensate(model, fits.Reference(np.zeros(0), np.zeros(0)))
 

@@ -32,12 +32,12 @@ def folder(tmp_path):
 def again(folder, tmp_path, monkeypatch):
     """Call a function as another process would: from the files alone, and without tracing."""
 
-    def call(function, *args):
+    def call(function, *args, **options):
         shutil.copytree(folder, tmp_path / "copy")
         keep_in(tmp_path / "copy")
         with monkeypatch.context() as patched:
             patched.setattr(_kept, "_traced", lambda *args: pytest.fail("traced again"))
-            return function(*args)
+            return function(*args, **options)
 
     return call
 
@@ -70,9 +70,9 @@ def test_stages_with_effects_answer_as_without(folder, again, rng):
     uncertainty = replace(uncertainty, coordinates=jnp.concatenate([uncertainty.coordinates, more], axis=1))
     record = replace(program(rng, stage, True), extra={"temperature_degC": rng.normal(21, 1, 300)})
     keep_in(None)
-    expected = predict(stage, uncertainty, record)
+    expected = predict(stage, record, uncertainty=uncertainty)
     keep_in(folder)
-    found = predict(stage, uncertainty, record), again(predict, stage, uncertainty, record)
+    found = predict(stage, record, uncertainty=uncertainty), again(predict, stage, record, uncertainty=uncertainty)
     for one in found:
         exact = {"rtol": 0, "atol": 1e-12 * np.ptp(expected.displacement_um)}
         np.testing.assert_allclose(one.displacement_um, expected.displacement_um, **exact)

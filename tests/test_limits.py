@@ -181,7 +181,7 @@ class Rig:
         range_V = (0.0, 120.0)
         known = [np.ones(len(record), dtype=bool) for record in self.records]
         reached, _ = reached_by(found.model, self.records, range_V, ["negative"] * 2, known)
-        drawn = fits.draw_plants(found.model, found.uncertainty, 5, seed=seed)
+        drawn = fits.draw_plants(found.model, 5, uncertainty=found.uncertainty, seed=seed)
         limits = allowed({**reached, "voltage": range_V}, {}, 0.02)
         self.guard = Guard(
             [Model(stage, 0.0, found.misfit.residual_um) for stage in drawn], limits, self.records[0], range_V

@@ -60,10 +60,10 @@ def test_an_uncertainty_of_another_kind_of_model_is_refused(rng):
     stage, uncertainty = draw(rng)
     program = Record(np.arange(3.0), np.zeros(3), None)
     with pytest.raises(DataError, match="the uncertainty is that of a stage"):
-        predict(stage["piezo"], uncertainty, program)
+        predict(stage["piezo"], program, uncertainty=uncertainty)
     other = Uncertainty(uncertainty.columns_um, uncertainty.mean_um, uncertainty.discrepancy_um, uncertainty.grid)
     with pytest.raises(DataError, match="the uncertainty is that of a hysteresis"):
-        predict(stage, other, program)
+        predict(stage, program, uncertainty=other)
 
 
 @pytest.fixture

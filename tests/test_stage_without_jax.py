@@ -106,7 +106,7 @@ def test_blocks_of_a_recurrence_are_led_on(count, alike, rng):
 def test_predictions_are_those_of_jax(hold, even, state, rng, tmp_path):
     stage, uncertainty = draw(rng, hold=hold, substeps=3)
     plain, record = saved(tmp_path / "s.json", stage, uncertainty), program(rng, stage, even)
-    found, expected = plain.predict(record, state), predict(stage, uncertainty, record, state)
+    found, expected = plain.predict(record, state), predict(stage, record, state, uncertainty=uncertainty)
     exact = {"rtol": 0, "atol": EXACT * stroke_um(stage["hysteresis"])}
     np.testing.assert_allclose(found.displacement_um, expected.displacement_um, **exact)
     np.testing.assert_allclose(found.displacement_sd_um, expected.displacement_sd_um, rtol=1e-11)
@@ -127,7 +127,7 @@ def test_one_sample_is_answered_as_the_first_of_two_is(hold, rng, tmp_path):
     plain, record = saved(tmp_path / "s.json", stage, uncertainty), program(rng, stage, True)
     one, two = (Record(record.time_s[:n], record.voltage_V[:n], None) for n in (1, 2))
     expected = plain.predict(two, "negative")
-    for found in (plain.predict(one, "negative"), predict(stage, uncertainty, one, "negative")):
+    for found in (plain.predict(one, "negative"), predict(stage, one, "negative", uncertainty=uncertainty)):
         assert found.displacement_um == pytest.approx(expected.displacement_um[:1], rel=1e-9)
         assert found.displacement_sd_um == pytest.approx(expected.displacement_sd_um[:1], rel=1e-9)
 

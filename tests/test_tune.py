@@ -256,13 +256,13 @@ def test_plants_are_drawn_with_the_covariance_of_the_fit(rng):
     factor = rng.normal(0, 0.1, (2, 1))
     none = jnp.zeros((2, 0))
     known = fits.StageUncertainty(jnp.asarray(factor), none, jnp.zeros(2), jnp.asarray(0.0), None)
-    plants = fits.draw_plants(stage, known, 400, seed=int(rng.integers(2**31)))
+    plants = fits.draw_plants(stage, 400, uncertainty=known, seed=int(rng.integers(2**31)))
     gains = np.array([float(one["piezo"].gain_um_per_V) for one in plants])
     assert gains[0] == pytest.approx(0.12)
     # The gain's scale is 0.1 um/V.
     assert gains[1:].std() == pytest.approx(0.1 * np.sqrt(np.sum(factor**2)), rel=0.2)
     with pytest.raises(fits.DataError, match="nothing of its uncertainty"):
-        fits.draw_plants(stage, None, 2)
-    assert fits.draw_plants(stage, None, 1) == (stage,)
+        fits.draw_plants(stage, 2)
+    assert fits.draw_plants(stage, 1) == (stage,)
     with pytest.raises(ValueError, match="count"):
-        fits.draw_plants(stage, known, 0)
+        fits.draw_plants(stage, 0, uncertainty=known)

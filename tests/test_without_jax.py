@@ -83,7 +83,7 @@ def test_predictions_are_those_of_jax(levels, rng, tmp_path):
             ]
         )
         sd_um = np.sqrt(np.sum(perturbed**2, axis=0) + float(uncertainty.discrepancy_um) ** 2)
-        for found in (loop.predict(record, state), predict(model, uncertainty, record, state)):
+        for found in (loop.predict(record, state), predict(model, record, state, uncertainty=uncertainty)):
             np.testing.assert_allclose(found.displacement_um, respond(model, voltage_V, start), **exact)
             np.testing.assert_allclose(found.displacement_sd_um, sd_um, **exact)
 

@@ -296,7 +296,7 @@ def predicted_by(
     model = stage_or_preisach(path, loaded)
     if loaded.uncertainty is None and isinstance(model, late.Preisach):
         raise DataError(f"{path}: the file lacks the uncertainty of its model; fit again.")
-    return late.predict(model, loaded.uncertainty, program, initial)
+    return late.predict(model, program, initial, uncertainty=loaded.uncertainty)
 
 
 def parse_rig_limits(

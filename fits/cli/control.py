@@ -129,7 +129,7 @@ def control(given: common.Given) -> None:
             longest = f"the reference's {wanted.time_s[-1]:g} s"
             raise DataError(f"--skip: expected less than {longest}, found {given.skip:g} s.")
         count = given.plants or (1 if loaded.uncertainty is None else 4)
-        plants = late.draw_plants(plant, loaded.uncertainty, count, seed=given.seed)
+        plants = late.draw_plants(plant, count, uncertainty=loaded.uncertainty, seed=given.seed)
         stages = [one.with_hold("zero") for one in plants]
         limits_of = {field: bound for name, field in _LIMITS.items() if (bound := getattr(given, name)) is not None}
         goal = late.Goal(given.effort, given.rate, **limits_of)

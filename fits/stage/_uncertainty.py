@@ -186,13 +186,14 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
 
 
 def predict(
-    model: Any, uncertainty: AbstractUncertainty | None, record: AnyRuns, initial: str = "negative"
+    model: Any, record: AnyRuns, initial: str = "negative", *, uncertainty: AbstractUncertainty | None = None
 ) -> Prediction:
     """Predict the displacement of a voltage program, with its uncertainty.
 
-    The model is a `Preisach` or a `Stage`, or a fit or a model file with its own uncertainty, or the name of such a
-    file; where there is no uncertainty the standard deviations are NaN. The program is a record, or what `read_table`
-    takes; its displacement, if any, is not looked at. The memory before its first sample is `negative`, `positive` or
+    The model is a `Preisach` or a `Stage`, with an `uncertainty` beside it or not, or a fit or a model file with its
+    own, or the name of such a file; where there is none the standard deviations are NaN. The program is a record, or
+    what `read_table` takes; its displacement, if any, is not looked at. The memory before its first sample is
+    `negative`, `positive` or
     `demagnetised`.
 
     A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
@@ -209,7 +210,7 @@ def predict(
 
 
 def draw_plants(
-    model: Any, uncertainty: Uncertainty | StageUncertainty | None, count: int, *, seed: int = 0
+    model: Any, count: int, *, uncertainty: Uncertainty | StageUncertainty | None = None, seed: int = 0
 ) -> tuple[Stage, ...]:
     """Draw stages from the covariance of a fit.
 
