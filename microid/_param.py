@@ -55,6 +55,13 @@ def _as_inexact(value: Any) -> Any:
     return jnp.asarray(value, dtype=float)
 
 
+def _within(value: Any, name: str, spec: ParameterSpec) -> Any:
+    """The value of a parameter as an array; a number that is out of bounds is refused, an array is a solver's."""
+    if isinstance(value, int | float):
+        _refuse_outside(spec, np.asarray(value), name)
+    return _as_inexact(value)
+
+
 def array(*, default: float | None = None) -> Any:
     """Declare an array field that is data, not a parameter: the voltage range, say.
 
@@ -80,7 +87,8 @@ def param(
     """Declare a field that can be fitted, with its unit, scale and bounds beside it.
 
     Every floating-point array at or below the field is a parameter. Bounds become bijections in
-    `Coordinates`; no solver option is involved.
+    `Coordinates`; no solver option is involved. A plain number that is put into the field and is out of bounds, or no
+    number, raises a `ValueError`.
 
     Parameters
     ----------
@@ -100,7 +108,9 @@ def param(
         raise ValueError(f"lower must be less than upper, got {lower} and {upper}")
     spec = ParameterSpec(unit, float(scale), float(lower), float(upper))
     given: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(converter=_as_inexact, metadata={_KEY: spec}, **given)
+    # A class gives its fields their names.
+    made: Any = eqx.field(converter=lambda value: _within(value, made.name, spec), metadata={_KEY: spec}, **given)
+    return made
 
 
 def _spec_of(model: Any, path: tuple[Any, ...]) -> ParameterSpec | None:
@@ -283,9 +293,8 @@ class Coordinates(eqx.Module, Generic[_Model]):
         return jax.tree_util.tree_unflatten(self._treedef, leaves)
 
 
-def _refuse_outside(spec: ParameterSpec, value: np.ndarray) -> None:
-    if np.any(value < spec.lower) or np.any(value > spec.upper):
-        worst = float(np.min(value)) if np.any(value < spec.lower) else float(np.max(value))
-        raise ValueError(
-            f"value {worst:g} {spec.unit} lies outside its bounds [{spec.lower:g}, {spec.upper:g}] {spec.unit}"
-        )
+def _refuse_outside(spec: ParameterSpec, value: np.ndarray, name: str = "value") -> None:
+    inside = (value >= spec.lower) & (value <= spec.upper)
+    if not np.all(inside):
+        worst, unit = float(value[~inside].flat[0]), spec.unit
+        raise ValueError(f"{name} {worst:g} {unit} lies outside its bounds [{spec.lower:g}, {spec.upper:g}] {unit}")

@@ -220,3 +220,15 @@ def test_fields_hold_strongly_typed_floats_whatever_is_given(given):
         assert field.dtype == (np.float32 if given.__class__ is np.float32 else np.float64)
         assert not field.weak_type
         assert float(field) == 3
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: m.Mechanics(-1.0, 0.1), r"natural_frequency_Hz -1 Hz lies outside its bounds \[1e-06, inf\] Hz"),
+        (lambda: m.Sensor(1.0, math.nan), r"offset_um nan um lies outside its bounds \[-inf, inf\] um"),
+    ],
+)
+def test_a_number_out_of_bounds_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
