@@ -43,3 +43,15 @@ def test_nothing_overflows_on_residuals_that_are_far_from_noise(rng, of):
     with np.errstate(over="raise", invalid="raise", divide="raise"):
         found = band_of(residual_um, 1e-3, time_s)
     assert np.isfinite([found.frequency_Hz, found.size_um, found.sd_um, found.quality, found.z]).all()
+
+
+def test_what_comes_back_with_the_voltage_is_no_vibration(rng):
+    """Kinks of a few plays, 11 V apart, passed at an even speed by loops that shrink: 45 a second, in time."""
+    time_s = np.arange(10000) / 2500
+    turns = np.cumsum(np.r_[0, 2 * np.linspace(200, 60, 40)])
+    place_V = np.interp(500 * time_s, turns / 2, np.r_[0, np.cumsum(np.resize([1, -1], 40) * np.diff(turns) / 2)])
+    kinks_um = 0.02 * np.sin(2 * np.pi * place_V / 11)
+    noise_um = 0.003 * rng.standard_normal(len(time_s))
+    assert band_of(kinks_um + noise_um, 1 / 2500, place_V).z < 8
+    shaking_um = 0.02 * np.sin(2 * np.pi * 45 * time_s + np.cumsum(0.02 * rng.standard_normal(len(time_s))))
+    assert band_of(shaking_um + noise_um, 1 / 2500, place_V).z > 8

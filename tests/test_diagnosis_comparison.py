@@ -68,7 +68,7 @@ def made(rng, plant, smooth=False):
         for one, out in zip(bare, plant(bench, entering_um), strict=True)
     ]
     bench = Bench(stage_on(seed, measured, smooth))
-    projector = Projector(regress(bench.baseline), [Noise(NOISE_UM, np.zeros(0))] * 2, (0.02, 0.05))
+    projector = Projector(regress(bench.baseline), [Noise(NOISE_UM, np.zeros(0))] * 2, (0.02, 0.05, 0.0))
     return SimpleNamespace(bench=bench, projector=projector, scales=scales_of(bench, NOISE_UM))
 
 

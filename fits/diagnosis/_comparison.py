@@ -100,7 +100,7 @@ def compare_rivals(
             fitted[one.form] = found
     rivals = [Rival.of(projector, one) for one in fitted.values()]
     without = model.cost + projector.surprise(before)
-    return _ranked(bench, projector, rivals, without, [one.probe for one in scores], thresholds)
+    return _ranked(bench, projector, rivals, without, [one.probe for one in scores], thresholds, has_time)
 
 
 def criterion(projector: Projector, model: Refit) -> float:
@@ -169,12 +169,13 @@ def _ranked(
     cost: float,
     asked: Sequence[Probe],
     thresholds: Thresholds,
+    has_time: Callable[[], bool],
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
     Without them there is a `cost`. About as good are also those that are behind the best by no more than twice what
     it gains by that, as they may gain more, until one ends behind it; and those that leave as little with the best
-    further effect of those `asked`.
+    further effect of those `asked`. Where the time is over the best alone is fitted.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = list[Rival]()
@@ -193,10 +194,11 @@ def _ranked(
             far = left_ahead(one) - ahead > near
         # The start of a lag is its own, however far it is from here. A lost resonance is looked for beside the best,
         # even where what it rings with passed for noise.
-        joint, is_lag = place < _NEAREST and not far, bool(one.refit.laws[-1].form.lag)
+        on_time = least == np.inf or has_time()
+        joint, is_lag = place < _NEAREST and not far and on_time, bool(one.refit.laws[-1].form.lag)
         quiet = order[0].refit.is_noise(projector, thresholds.chance_z)
         shown = not is_lag or one.refit.determined(thresholds.determined_z, False, quiet)
-        starts = not quiet if is_lag else place == 0
+        starts = on_time and (not quiet if is_lag else place == 0)
         ends = fit_from_poles(bench, projector, one.refit, not shown) if starts else []
         if joint and shown:
             ends.append(fit_jointly(bench, projector, one.refit))

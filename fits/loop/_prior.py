@@ -27,6 +27,8 @@ from fits.stats._bfgs import minimise
 _MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2), 14.0)
 # How far, in e-folds, they are believed to be from there.
 _WIDTH = 6.0
+# Rounds in which the noise is found beside it before that is searched for.
+_ROUNDS = 2
 # What rounding may take off a diagonal, relative to its largest entry.
 _ROUNDING = 1e-14
 # Least eigenvalue of a scaled precision, over the largest, that rounding leaves.
@@ -319,7 +321,12 @@ def inverse(root: np.ndarray) -> np.ndarray:
 def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper | None) -> Hyper:
     """Find the smoothness and the noise under which the data, in strokes, are most probable, from a start if any."""
     evidence, cold = Evidence(moments, rough), start is None
-    start = Hyper.start() if start is None else start
+    # Where curvature counts for nothing, or for all, the evidence is flat along it, and no way leads back.
+    start = Hyper.start() if start is None else replace(start, log_density=Hyper.start().log_density)
+    # Far from the noise that there is the evidence is so steep that the search leaps over what it looks for.
+    for _ in range(_ROUNDS):
+        posterior = Posterior.of(moments, rough, start)
+        start = renew_noise(moments, start, posterior, effective(rough, start, posterior))
     first = np.array([float(log) for log in jax.tree.leaves(start)])
     # A step too far is not finite, and taken back. Out of steps on a flat evidence, the best place so far is as good
     # as any; the regression itself must converge.
@@ -342,4 +349,4 @@ def renew_noise(
     xp, _ = _algebra(moments.gram, posterior.mean)
     left = moments.energy_um2 - 2 * posterior.mean @ moments.cross_um + posterior.mean @ moments.gram @ posterior.mean
     variance = xp.maximum(left, 0) / xp.maximum(moments.count - determined, 1)
-    return Hyper.of(*hyper.weights, xp.log(xp.maximum(variance, 1e-30)))
+    return replace(hyper, log_variance=xp.log(xp.maximum(variance, 1e-30)))

@@ -8,7 +8,18 @@ from itertools import chain
 import numpy as np
 
 from fits.diagnosis._result import Diagnosis, RunView
-from fits.report._words import NONE, estimate, length, listed, number, parameter_name, percent, plain, shown_unit
+from fits.report._words import (
+    NOISY,
+    NONE,
+    estimate,
+    length,
+    listed,
+    number,
+    parameter_name,
+    percent,
+    plain,
+    shown_unit,
+)
 from microid.effects import AbstractEffect, card_of
 
 
@@ -65,6 +76,11 @@ def _use(diagnosis: Diagnosis) -> tuple[str, str]:
         words = f"Mend this where it arises: {named}. It is in the readings, and no model of the stage takes it away"
     else:
         words = "Use the plain stage: these records need no more"
+        if before > NOISY * gain.noise_um:
+            words = (
+                f"Use the plain stage only where the fitted records went: what was not used it predicts to "
+                f"{length(before)}, root mean square, over a noise floor of {length(gain.noise_um)}"
+            )
     return f"{words}.", f"microid compensate {name} reference.csv --dynamic --out voltage.csv"
 
 

@@ -11,7 +11,7 @@ from fits.loop._result import ParameterEstimate
 from microid.effects import card_of
 
 # A residual of more times the noise floor is not called noise.
-_NOISY = 1.2
+NOISY = 1.2
 _UNITS = {"um": "µm", "degC": "°C"}
 # What stands for a number that is not known.
 NONE = "\N{EN DASH}"
@@ -161,7 +161,7 @@ def _found(diagnosis: Diagnosis) -> str:
         )
     if not diagnosis.causes:
         described = "describes these records down to"
-        if over_um > _NOISY * diagnosis.noise_um:
+        if over_um > NOISY * diagnosis.noise_um:
             described = f"leaves {length(over_um)}, root mean square, in which no effect shows, over"
         return (
             f"The plain stage {described} a noise floor of {noise}. Of records that hold no effect, "

@@ -7,6 +7,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
 from fits.io._quantity import FloatArray
+from fits.stats._noise import repeated_square
 from fits.stats._noise_spectrum import DRIFT, MAINS_Hz
 
 # Where a band is looked for, in Hz, and from how many cycles in the record on.
@@ -23,6 +24,8 @@ _NARROW = 3.0
 _LINE = 4
 # Bins of less than this part of the strongest one's power hold nothing but rounding.
 _ROUNDING = float(np.finfo(float).eps) ** 2
+# What moves with the rig and makes more than this part of a band is no vibration.
+_SHARE = 0.5
 # A level is looked for within so many e-folds.
 _REACH = 30.0
 # Qualities, and heights above the floor, from which the likelihood climbs.
@@ -61,7 +64,7 @@ class Band:
 
 
 def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -> Band:
-    """Find a narrow band between 2 and 200 Hz that goes on throughout and that the command does not play.
+    """Find a narrow band between 2 and 200 Hz that goes on throughout and does not come of what the command plays.
 
     Residual and command are evenly sampled, shape `(n,)`. Where the samples show too few frequencies of that range,
     nothing is found, with an evidence of 0.
@@ -101,11 +104,23 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     if not _steady(residual, best / n, 2 * width_Hz * interval_s):
         return none
     # The area of the peak, whose bins stand for two each.
-    size_um = scale_um * float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n) ** 0.5
+    square = float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n)
+    if _comes_back(residual, command_V, 1 / (middle_Hz * interval_s)) > _SHARE * square:
+        return none
+    size_um = scale_um * square**0.5
     # Noise of this width has so many independent values.
     sd_um = size_um / (2 * max(width_Hz * n * interval_s, 1.0) ** 0.5)
     z = max(2 * (found - nothing - np.log(inside.sum())), 0.0) ** 0.5
     return Band(middle_Hz, size_um, sd_um, quality, float(z), 1 / interval_s, bins)
+
+
+def _comes_back(residual: FloatArray, command_V: FloatArray, period: float) -> float:
+    """Variance of what is the same wherever the command goes up, or down, through the same voltage again.
+
+    Instants are compared that are so many samples apart, a period of the band, or more.
+    """
+    falling = np.gradient(command_V) < 0
+    return repeated_square(command_V + 2 * np.ptp(command_V) * falling, residual, period / 5)
 
 
 def _power(values: FloatArray) -> FloatArray:
