@@ -38,6 +38,10 @@ from fits.loop._run import known_samples
 from fits.stats._held import held_gain
 from microid.effects import card_of
 
+_OWN_LAG = (
+    "the plain stage has no dynamics, which these runs do not show apart: the lag may be that of the driver and of "
+    "the mechanics, which every stage has"
+)
 # Part of the stroke below which a change of the feedforward is rounding.
 _MET = 1e-9
 
@@ -78,7 +82,7 @@ def conclude(
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
     # Weak evidence needs the support of what was held out.
-    worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z, thresholds.model_error)
+    worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z, thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
         why = "what was held out is predicted worse with that"
         if misfit.share < thresholds.explained_share:
@@ -118,6 +122,8 @@ def conclude(
             f"{', '.join(sorted(bound))}: a parameter ended at the bound of what such an effect may have, so that "
             "something else that looks alike may be there instead"
         )
+    if not baseline.dynamic and any(card_of(cause.name).lag or card_of(cause.name).delay for cause in kept):
+        remarks.append(_OWN_LAG)
     remarks += _before_the_runs(model, thresholds.determined_z)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)

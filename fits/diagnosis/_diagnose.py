@@ -32,12 +32,12 @@ _ALL = (
     "them, so that the gain is not measured on new data"
 )
 _UNKNOWN = (
-    "what was fitted is at the noise, and the runs held out are off by {:.2g} times it: where they go the hysteresis "
-    "is not known, or something shows only there; to ask for it, diagnose them with the others"
+    "no effect is left in what was fitted, and the runs held out are off by {:.2g} times the noise: where they go "
+    "the hysteresis is not known, or something shows only there; to ask for it, diagnose them with the others"
 )
 _UNSEEN = (
-    "what was fitted is at the noise, and what was held out is off by {:.2g} times it: something shows only there, "
-    "as a resonance that a sweep reaches at its end; to ask for it, hold out nothing"
+    "no effect is left in what was fitted, and what was held out is off by {:.2g} times the noise: something shows "
+    "only there, as a resonance that a sweep reaches at its end; to ask for it, hold out nothing"
 )
 
 

@@ -27,6 +27,9 @@ class Thresholds:
     worse_z
         Standard deviations by which an extension may predict held-out data worse, and by which one that hardly stands
         out of the rest of the misfit must predict them better.
+    worse_share
+        Part of their mean square by which errors in held-out data may grow with an extension: what the data held out
+        do not show changes by less than that, by chance.
     strong_z
         Evidence, in standard deviations, that needs no support by other data.
     other_hold_z
@@ -57,6 +60,7 @@ class Thresholds:
     determined_z: float = 3.0
     chance_z: float = 3.0
     worse_z: float = 2.0
+    worse_share: float = 0.005
     strong_z: float = 8.0
     other_hold_z: float = 5.0
     explained_share: float = 0.65
