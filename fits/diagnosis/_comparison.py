@@ -169,7 +169,7 @@ def _ranked(
     cost: float,
     asked: Sequence[Probe],
     thresholds: Thresholds,
-    has_time: Callable[[], bool],
+    has_time: Callable[[], bool] = lambda: True,
 ) -> list[Rival]:
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
@@ -217,11 +217,12 @@ def _ranked(
             near = usual
         least = min(least, found.cost)
         out.append(replace(found, refit=one.refit, end=end))
-    # Of an effect the best form counts, which may be another once the baseline has followed.
+    # Of an effect the best form counts, which may be another once the baseline has followed. Where it has not comes
+    # last.
     best: dict[str, Rival] = {}
-    for one in sorted(out, key=lambda one: one.criterion):
+    for one in sorted(out, key=lambda one: (one.end is None, one.criterion)):
         best.setdefault(one.name, one)
-    return list(best.values())
+    return sorted(best.values(), key=lambda one: one.criterion)
 
 
 def has_occurred(bench: Bench, model: Refit, place: int = -1) -> bool:

@@ -78,21 +78,23 @@ def conclude(
     extension = extend_stage(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, [*_remarks(ready, records)]
     weak = max((cause.z for cause in kept), default=0.0) < thresholds.strong_z
+    # What is small beside the noise may be an error of the plain stage that is too small to show.
+    small = misfit.explained < thresholds.rest_noise**2 * misfit.count
     # Of what one run had of its own other runs show nothing.
     repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
-    # Weak evidence needs the support of what was held out.
-    worse = predicts_worse(seen, 0.0 if weak else thresholds.worse_z, thresholds.worse_share)
+    # Both need the support of what was held out.
+    most_z = -thresholds.worse_z / 2 if weak or small else thresholds.worse_z
+    worse = predicts_worse(seen, most_z, thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
-        why = "what was held out is predicted worse with that"
+        why = f"what was held out is predicted {'no better' if weak or small else 'worse'} with that"
         if misfit.share < thresholds.explained_share:
             why = f"that explains only {100 * misfit.share:.0f} % of it"
         remarks.append(not_named([cause.name for cause in kept], why))
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak)
         extension = extend_stage(ready, found, None)
-    else:
-        remarks += minor
+    remarks += minor
     if kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
         own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if one.per_run}))
         remarks.append(f"{own}: not the same in the runs held out, so that the stage is left plain")
@@ -107,7 +109,7 @@ def conclude(
     if cyclic:
         remarks.append(
             f"what is left repeats itself every {length(repeated.period_um)} of the position, as the error of an "
-            "interferometer or an encoder does"
+            "interferometer or an encoder does, and a hysteresis of few plays"
         )
     rest_um = rest_noise * noise_um if left_over else 0.0
     faults = _standing(

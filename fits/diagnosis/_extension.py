@@ -142,8 +142,9 @@ _without = eqx.filter_jit(project_out)
 
 
 def predicts_worse(compared: Sequence[Compared], worse_z: float, most: float) -> bool:
-    """Whether the extended stage predicts what was held out worse; see `fits.stats._compare.is_worse`."""
-    return is_worse(*_held_out(compared), worse_z, most)
+    """Whether the extended stage predicts worse what was held out, if any; see `fits.stats._compare.is_worse`."""
+    before, after = _held_out(compared)
+    return len(before) > 0 and is_worse(before, after, worse_z, most)
 
 
 def _held_out(compared: Sequence[Compared]) -> tuple[np.ndarray, np.ndarray]:

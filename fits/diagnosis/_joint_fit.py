@@ -154,7 +154,7 @@ def refine(
     # What is asked of the causes from here on is asked as they were fitted.
     bench, projector = Bench(state[0].baseline, finest=True) if finest else state[0], state[1]
     inside = leave_bounds(bench, projector, model, finest) if has_time() else (bench, projector, model)
-    return *keep_density_positive(*inside, finest), finest
+    return *keep_density_positive(*inside, finest, has_time), finest
 
 
 def try_larger_strengths(bench: Bench, projector: Projector, model: Refit) -> State:
@@ -224,13 +224,17 @@ def leave_bounds(bench: Bench, projector: Projector, model: Refit, finest: bool)
     return bench, projector, model
 
 
-def keep_density_positive(bench: Bench, projector: Projector, model: Refit, finest: bool) -> State:
-    """Fit the causes again beside a density that is nowhere negative.
+def keep_density_positive(
+    bench: Bench, projector: Projector, model: Refit, finest: bool, has_time: Callable[[], bool] = lambda: True
+) -> State:
+    """Fit the causes again beside a density that is nowhere negative, once if it no longer `has_time`.
 
     A linearised density may take less than nothing, and there a cause may hide: a play in relays without width, a
     rail in those beyond it.
     """
-    for _ in range(_BOUNDED if model.laws else 0):
+    for number in range(_BOUNDED if model.laws else 0):
+        if number and not has_time():
+            break
         moved = _follow(projector, model, finest)
         columns_um, regression = moved[0].baseline.columns_um, moved[1].regression
         free = np.concatenate([columns_um > 0, np.ones(regression.size - len(columns_um), dtype=bool)])
