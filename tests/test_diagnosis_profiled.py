@@ -21,6 +21,7 @@ from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._noise import Noise
 from microid import Driver
 from microid.effects import EFFECTS
+from microid.effects.mains_hum import MainsHum
 
 STEP_S, COUNT = 0.01, 3300
 
@@ -113,6 +114,27 @@ def test_a_fit_finds_its_way_from_near_a_bound():
     projector = SimpleNamespace(residual=0.8 * column, off=lambda joined: joined, join=lambda signals: signals[0])
     found = refit(bench, projector, [law], [law.start])
     assert float(law.effect(found.x[0], 0).slope) == pytest.approx(0.8, abs=1e-3)
+
+
+def test_a_line_turns_its_amplitudes_as_its_frequency_is_found(rng):
+    # 0.02 Hz off the phase runs away by a turn and a half: large amplitudes have to change place.
+    time_s, phase = np.arange(4000) / 500, rng.uniform(0, 2 * np.pi)
+    wave = 2 * np.pi * 50.025 * time_s + phase
+
+    def lines(run, own):
+        turns = 2 * np.pi * float(own[0].frequency_Hz) * time_s * np.arange(1, 4)[:, None]
+        return np.asarray(own[0].cosine_um) @ np.cos(turns) + np.asarray(own[0].sine_um) @ np.sin(turns)
+
+    start = np.array([0.4 * np.cos(phase + 1.0), 0.0, 0.0]), np.array([-0.4 * np.sin(phase + 1.0), 0.0, 0.0])
+    law = Law([MainsHum(*map(jnp.asarray, start), jnp.asarray(50.008))])
+    bench = SimpleNamespace(prepared=[None], plain=[np.zeros(4000)], respond_in=lines)
+    noise = 0.06 * rng.standard_normal(4000)
+    projector = SimpleNamespace(
+        residual=(0.4 * np.cos(wave) + noise) / 0.06, off=lambda joined: joined, join=lambda um: um[0] / 0.06
+    )
+    found = refit(bench, projector, [law], [law.start])
+    assert float(law.effect(found.x[0], 0).frequency_Hz) == pytest.approx(50.025, abs=1.2e-3)
+    assert found.cost == pytest.approx(4000, rel=0.12)
 
 
 def at_slope(value, truth):

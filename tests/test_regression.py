@@ -95,6 +95,25 @@ def test_evidence_is_the_density_of_the_data_under_the_prior(rng):
     assert best <= exact.fun + 0.02
 
 
+@pytest.mark.parametrize(
+    "start", [None, Hyper.of(16.8, 1.0, 6.8, 4.7, -12.3), Hyper.of(-12.0, 0.0, 10.0, 6.0, -14.0)]
+)
+def test_noise_far_above_the_start_and_smoothness_that_counts_for_all_or_nothing_hide_no_evidence(rng, start):
+    grid = Grid(jnp.asarray(-10.0), jnp.asarray(90.0), 16)
+    record = _record(rng)
+    shaken = np.where(rng.random(700) < 0.03, 40 * rng.choice([-1.0, 1.0], 700), 0.0)
+    run = prepare_run(
+        fits.Record(record.time_s, record.voltage_V, record.displacement_um + shaken), (-10, 90), "negative", 0
+    )
+    data, rough = gather(grid, [run]).total.scaled(1.0, 30.0), roughness(16)
+    found, evidence = maximise_evidence(data, rough, start), Evidence(data, rough)
+    # The noise is what is there, and nothing else is more probable, wherever it is looked for.
+    assert np.exp(float(found.log_variance) / 2) == pytest.approx(np.std(shaken) / 30, rel=0.2)
+    others = [np.array([*rng.uniform((-12, -5, -5, -5), (4, 3, 9, 6)), rng.uniform(-5, -1)]) for _ in range(6)]
+    exact = [minimize(evidence.value, one, jac=evidence.slope, method="L-BFGS-B").fun for one in others]
+    assert -evidence.of(found) <= np.nanmin(exact) + 1.0
+
+
 def test_slope_of_the_evidence_is_that_of_its_values(problem):
     _, _, data = problem
     evidence, step = Evidence(data.total, roughness(LEVELS)), 1e-3
