@@ -136,14 +136,13 @@ class Law:
     @property
     def strengths(self) -> np.ndarray:
         """Which coordinates are strengths, shape `(size,)`."""
-        return self._in_all_runs(self._of(self.form.strength))
+        strong = self._of(self.form.strength)
+        return np.concatenate([strong[~self.each], np.tile(strong[self.each], len(self.maps))])
 
     @property
-    def unbounded(self) -> np.ndarray:
-        """Which coordinates are in proportion to their parameters, shape `(size,)`."""
-        return self._in_all_runs(
-            self._of([i.path for i, _ in self.entries if -i.spec.lower == i.spec.upper == np.inf])
-        )
+    def turning(self) -> np.ndarray:
+        """Which coordinates are cosines and sines of lines, which turn into each other, shape `(size,)`."""
+        return self.strengths & bool(self.form.lines_Hz)
 
     @property
     def common(self) -> dict[str, int]:
@@ -156,9 +155,6 @@ class Law:
 
     def _of(self, paths: Sequence[str]) -> np.ndarray:
         return np.concatenate([np.full(at.stop - at.start, info.path in paths) for info, at in self.entries])
-
-    def _in_all_runs(self, which: np.ndarray) -> np.ndarray:
-        return np.concatenate([which[~self.each], np.tile(which[self.each], len(self.maps))])
 
     @property
     def size(self) -> int:

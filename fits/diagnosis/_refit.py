@@ -308,7 +308,7 @@ def _fit(
     residual = left(at_um)
     jacobian = slope() if rounds else np.zeros((len(residual), len(flat)))
     damping, farthest = 1e-3, _FARTHEST
-    unbounded = np.concatenate([law.unbounded for law in moving])
+    turning = np.concatenate([law.turning for law in moving])
     for _ in range(rounds):
         cost = float(residual @ residual)
         scale = np.linalg.norm(jacobian, axis=0) + 1e-300
@@ -317,8 +317,8 @@ def _fit(
         for _ in range(4):
             step = -np.linalg.solve(gram + damping * np.eye(len(flat)), cross) / scale
             # No coordinate moves by more than a few e-folds at a time, or than less where that was too far, as near a
-            # bound; one at its bound holds no other back. Cosine and sine of a line are turned as its frequency is.
-            step = np.where(unbounded, step, np.clip(step, -farthest, farthest))
+            # bound; one at its bound holds no other back. Cosine and sine of a line turn as its frequency moves.
+            step = np.where(turning, step, np.clip(step, -farthest, farthest))
             ahead_um = [change_in(run, flat + step) for run in range(runs)]
             trial = left(ahead_um)
             if float(trial @ trial) < cost:
