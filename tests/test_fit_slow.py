@@ -45,7 +45,7 @@ def result(record):
 
 
 def test_what_lags_and_relaxes_is_fitted_beside_the_loop(record, result):
-    assert result.held_out.rms_um < 1.3 * NOISE_um
+    assert result.held_out.rms_um < 1.6 * NOISE_um
     assert result["lag.time_constant_s"].value == pytest.approx(LAG_s, rel=0.1)
     alone = fits.fit([record], levels=LEVELS, holdout=0.25, initial="negative")
     assert alone.held_out.rms_um > 3 * result.held_out.rms_um
@@ -77,7 +77,7 @@ def test_the_command_takes_both(record, tmp_path):
     assert done.exit_code == 0
     said = json.loads(done.stdout)
     assert said["parts"][0]["name"] == "hysteresis"
-    assert said["held_out"]["rms_um"] < 1.3 * NOISE_um
+    assert said["held_out"]["rms_um"] < 1.6 * NOISE_um
     refused(run(*asked, "--model", "stage", "--out", tmp_path / "other.json"), "--lag")
 
 
