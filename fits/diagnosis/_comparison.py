@@ -174,8 +174,8 @@ def _ranked(
     """Put effects in order, the best and those about as good by what they leave once the baseline has followed.
 
     Without them there is a `cost`. About as good are also those that are behind the best by no more than twice what
-    it gains by that, as they may gain more, until one ends behind it; and those that leave as little with the best
-    further effect of those `asked`. Where the time is over the best alone is fitted.
+    it gains or loses by that, as they may gain more, until one ends behind it; and those that leave as little with
+    the best further effect of those `asked`. Where the time is over the best alone is fitted.
     """
     order = sorted(fitted, key=lambda one: one.criterion)
     out = list[Rival]()
@@ -212,7 +212,7 @@ def _ranked(
         if not end[-1].possible(bench):
             continue
         if least == np.inf:
-            near = max(usual, 2 * (one.cost - found.cost))
+            near = max(usual, 2 * abs(one.cost - found.cost))
         elif found.cost > least + thresholds.apart_z**2:
             near = usual
         least = min(least, found.cost)

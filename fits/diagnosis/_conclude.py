@@ -92,7 +92,7 @@ def conclude(
             why = f"that explains only {100 * misfit.share:.0f} % of it"
         remarks.append(not_named([cause.name for cause in kept], why))
         model, kept = found.plain, ()
-        rest_noise, left_over = misfit.unnamed(weak)
+        rest_noise, left_over = misfit.unnamed(weak or small)
         extension = extend_stage(ready, found, None)
     remarks += minor
     if kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
