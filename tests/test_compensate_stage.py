@@ -182,7 +182,7 @@ def test_what_is_out_of_reach_beside_an_effect_is_not_said_of_the_reference(rng)
     # A creep that goes on: towards the end the plain stage is to be lower than it can be.
     creep = next(one for one in microid.effects.EFFECTS if one.name == "creep")
     law = random_model(rng, 12)
-    stage = microid.effects.extend(microid.Stage.of(hysteresis=law), creep(0.2, 0.05))
+    stage = microid.effects.extend(microid.Stage.of(hysteresis=law), creep(0.1, 0.05))
     low, high = ends_um(law)
     time_s = np.linspace(0, 2, 400)
     there = Reference(time_s, low + (high - low) * 0.8 * np.clip(np.minimum(time_s, 2 - time_s), 0, 0.5), "r.csv")

@@ -254,7 +254,7 @@ def asked(monkeypatch):
     """How records were read, in order; the answers are made by hand."""
     log = SimpleNamespace(readings=[], answers=[])
 
-    def prepare(reading, progress):
+    def prepare(reading, progress, has_time):
         log.readings.append(reading)
         baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("said",))
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}

@@ -25,6 +25,8 @@ from microid.effects import card_of
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
+# Part of the budget after which the stage is not fitted in yet another way before effects are asked for.
+_PREPARED = 0.4
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
 _ALL = (
@@ -135,7 +137,7 @@ def diagnose(
         return time.monotonic() < end_s
 
     def answer(reading: Reading, *remarks: str) -> Diagnosis:
-        ready = prepare_diagnosis(reading, progress)
+        ready = prepare_diagnosis(reading, progress, lambda: time.monotonic() < begin_s + _PREPARED * budget_s)
         remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
         ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
         progress(Step.SELECTION)

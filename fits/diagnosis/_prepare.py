@@ -39,6 +39,9 @@ _CURVES = (
     "the command is taken to run along curves through its samples, since that leaves less of the displacement than "
     "lines do"
 )
+_NOT_ASKED = (
+    "whether the command runs {} between its samples was not asked, for lack of time: give it a larger budget"
+)
 _CLOSED = (
     "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
     "only along the way that it took"
@@ -171,8 +174,13 @@ class _Fit:
         return max((one.z for one in scores), default=0.0)
 
 
-def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prepared:
-    """Fit the plain stage, learn the noise, and simulate every probe of every effect."""
+def prepare_diagnosis(
+    reading: Reading, progress: Callable[[str], None], has_time: Callable[[], bool] = lambda: True
+) -> Prepared:
+    """Fit the plain stage, learn the noise, and simulate every probe of every effect.
+
+    The stage is fitted again, its command in another way between samples, only where it still `has_time`.
+    """
     records, initial, fraction = reading.records, reading.initial, reading.fraction
     said: tuple[str, ...] = ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
@@ -196,6 +204,9 @@ def prepare_diagnosis(reading: Reading, progress: Callable[[str], None]) -> Prep
     taken = ""
     for hold, (words, remark) in _RUNS.items():
         if here.regression.baseline.dynamic and here.prefers(hold, reading.thresholds):
+            if not has_time():
+                said = (*said, _NOT_ASKED.format(words))
+                break
             progress(f"fitting the plain stage again, its command {words}")
             drop_programs(records)
             other = fitted(hold, here.regression.baseline.problem)

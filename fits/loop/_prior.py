@@ -1,7 +1,6 @@
 """How smooth and how noisy a density is believed to be: found by maximising the evidence, not set by hand.
 
-The algebra is that of NumPy and SciPy where the moments are NumPy's, so that nothing is compiled for one fit; in
-traced programs, such as many fits at once, it is JAX's.
+The algebra is NumPy's and SciPy's where the moments are, so that one fit compiles nothing, and else JAX's.
 """
 
 from dataclasses import replace
@@ -27,10 +26,8 @@ from fits.stats._bfgs import minimise
 _MIDDLING = (-12.0, np.log(1e-2), 2.0, np.log(1e-2), 14.0)
 # How far, in e-folds, they are believed to be from there.
 _WIDTH = 6.0
-# Rounds in which the noise is found beside it before that is searched for.
-_ROUNDS = 2
-# What rounding may take off a diagonal, relative to its largest entry.
-_ROUNDING = 1e-14
+# Rounds in which the noise is found first; what rounding may take off a diagonal, relative to its largest entry.
+_ROUNDS, _ROUNDING = 2, 1e-14
 # Least eigenvalue of a scaled precision, over the largest, that rounding leaves.
 _LEAST = 1e-12
 
@@ -326,10 +323,10 @@ def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper | None) -
     # Far from the noise that there is the evidence is so steep that the search leaps over what it looks for.
     for _ in range(_ROUNDS):
         posterior = Posterior.of(moments, rough, start)
-        start = renew_noise(moments, start, posterior, effective(rough, start, posterior))
+        found = renew_noise(moments, start, posterior, effective(rough, start, posterior))
+        start = found if np.isfinite(found.log_variance) else start
     first = np.array([float(log) for log in jax.tree.leaves(start)])
-    # A step too far is not finite, and taken back. Out of steps on a flat evidence, the best place so far is as good
-    # as any; the regression itself must converge.
+    # A step too far is not finite, and taken back. Out of steps the best place so far is as good as any.
     with np.errstate(all="ignore"):
         return Hyper.of(*minimise(evidence.both, first, 1e-3, 1e-2, most_steps=128, cold=cold))
 
