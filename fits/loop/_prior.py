@@ -318,8 +318,9 @@ def inverse(root: np.ndarray) -> np.ndarray:
 def maximise_evidence(moments: Moments, rough: Roughness, start: Hyper | None) -> Hyper:
     """Find the smoothness and the noise under which the data, in strokes, are most probable, from a start if any."""
     evidence, cold = Evidence(moments, rough), start is None
+    start, fresh = start or Hyper.start(), Hyper.start().log_density
     # Where curvature counts for nothing, or for all, the evidence is flat along it, and no way leads back.
-    start = Hyper.start() if start is None else replace(start, log_density=Hyper.start().log_density)
+    start = replace(start, log_density=fresh) if abs(float(start.log_density - fresh)) > _WIDTH else start
     # Far from the noise that there is the evidence is so steep that the search leaps over what it looks for.
     for _ in range(_ROUNDS):
         posterior = Posterior.of(moments, rough, start)
