@@ -217,8 +217,8 @@ def _ranked(
             near = usual
         least = min(least, found.cost)
         out.append(replace(found, refit=one.refit, end=end))
-    # Of an effect the best form counts, which may be another once the baseline has followed. Where it has not comes
-    # last.
+    # Of an effect the best form counts, which may be another once the baseline has followed. A form beside which it
+    # has not followed stands behind those beside which it has.
     best: dict[str, Rival] = {}
     for one in sorted(out, key=lambda one: (one.end is None, one.criterion)):
         best.setdefault(one.name, one)

@@ -193,8 +193,7 @@ def predict(
     The model is a `Preisach` or a `Stage`, with an `uncertainty` beside it or not, or a fit or a model file with its
     own, or the name of such a file; where there is none the standard deviations are NaN. The program is a record, or
     what `read_table` takes; its displacement, if any, is not looked at. The memory before its first sample is
-    `negative`, `positive` or
-    `demagnetised`.
+    `negative`, `positive` or `demagnetised`.
 
     A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
     another column, which the program lacks, or that the uncertainty is that of another kind of model.
