@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -123,12 +124,15 @@ def fit_baseline(
     holdout: float,
     initial: str,
     progress: Callable[[str], None],
-    hold: Hold = "first",
+    holds: Sequence[Hold] = (),
+    aside_z: float = np.inf,
     onward: Problem | None = None,
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
-    `hold` says how the command runs between samples, as in `Stage`; the fit goes `onward` from one that was made.
+    `holds` say how the commands of `records` run between samples, as in `Stage`, in lines by default. Those of
+    `aside` run as most of these do, unless they are predicted better otherwise by `aside_z` standard deviations. The
+    fit goes `onward` from one that was made.
 
     Raises
     ------
@@ -139,12 +143,15 @@ def fit_baseline(
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()
+    lines: list[Hold] = ["first"] * len(records)
+    holds = holds or lines
+    hold = holds[0] if len({*holds}) == 1 else "first"
     past = has_known_loop(records, range_V, holdout)
     try:
         near = None if onward is None else onward.held(hold)
         stage = default_stage(hold) if near is None else near.stage
         settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
-        found = solve_stage(*settings, accept_best=True, estimated=past, onward=near)
+        found = solve_stage(*settings, accept_best=True, estimated=past, onward=near, holds=holds)
     except (DataError, FitError) as error:
         # That is what is done.
         why = str(error).removesuffix(BESIDE_A_LAG).removesuffix(f", {OR_ALONE}")
@@ -155,11 +162,13 @@ def fit_baseline(
     stride = solved.runs[0].stride
 
     def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        held = _prepared(aside, range_V, initial, 0.0, many, False, hold)
-        return _prepared(records, range_V, initial, holdout, many, past, hold), held
+        held = _prepared(aside, range_V, initial, 0.0, many, False, held_holds)
+        return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
+    asked = _prepared(aside, range_V, initial, 0.0, _FINE, False)
+    held_holds = [_hold_of(solved.stage, run, aside_z) for run in asked]
     # What a step starts is over soon, and slow runs sample it sparsely.
-    many = _FINE_STEPS if hold == "zero" else _FINE
+    many = _FINE_STEPS if "zero" in (*holds, *held_holds) else _FINE
     (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
     return Baseline(
         *(chain, solved.z, solved.columns_um, prior, stroke_um, range_V, runs, held),
@@ -209,10 +218,25 @@ def _prepared(
     holdout: float,
     stride: int,
     estimated: bool,
-    hold: Hold = "first",
+    holds: Sequence[Hold] = (),
 ) -> tuple[Run, ...]:
-    settings = range_V, initial, holdout, stride
-    return tuple(prepare_run(record, *settings, hold=hold, estimated=estimated) for record in records)
+    lines: list[Hold] = ["first"] * len(records)
+    settings, each = (range_V, initial, holdout, stride), zip(records, holds or lines, strict=True)
+    return tuple(prepare_run(record, *settings, hold=hold, estimated=estimated) for record, hold in each)
+
+
+def _hold_of(stage: Stage, run: Run, least_z: float) -> Hold:
+    """How the command of a run seems to go between samples, by what a stage that was fitted to others predicts.
+
+    As in the others unless there is evidence, which is asked of fast changes: there slow errors are small.
+    """
+    found: dict[Hold, float] = {}
+    for hold in get_args(Hold):
+        left = run.displacement_um - simulate(stage, replace(run, hold=hold))
+        found[hold] = float(np.sum(np.diff(left[run.known]) ** 2))
+    best = min(found, key=lambda hold: found[hold])
+    gained = run.known.sum() * np.log(found[stage.hold] / max(found[best], 1e-300))
+    return best if gained > least_z**2 else stage.hold
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:

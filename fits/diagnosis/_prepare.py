@@ -2,26 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline, fit_baseline, simulate
+from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
-from fits.diagnosis._effects import Bench, Law, drop_programs
-from fits.diagnosis._joint_fit import fit_from_poles
+from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
+from fits.diagnosis._plain_fit import Holds, PlainFit
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
-from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
+from fits.diagnosis._score import Probe
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
 from fits.stage._solve import Problem
 from fits.stats._held import held_gain
 from microid import Hold
-from microid.effects import EFFECTS, Scales
 
 # A delay below this part of the sampling interval is no effect, but one of each run's own.
 _SKEW = 0.04
@@ -32,15 +29,18 @@ _SKEWED = (
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
 _STEPS = (
-    "the command is taken to be held between samples, as a converter does, since the readings are late by half a "
+    "the command{} is taken to be held between samples, as a converter does, since the readings are late by half a "
     "sample; a delay of that length would look the same"
 )
 _CURVES = (
-    "the command is taken to run along curves through its samples, since that leaves less of the displacement than "
+    "the command{} is taken to run along curves through its samples, since that leaves less of the displacement than "
     "lines do"
 )
+_LINES = "the command{} is taken to run in lines between samples"
+_ASIDE = "the command of {}, held out, is taken to {} between samples, since it is predicted better so"
 _NOT_ASKED = (
-    "whether the command runs {} between its samples was not asked, for lack of time: give it a larger budget"
+    "the command seems to run along curves or in steps between its samples, and the stage was not fitted again with "
+    "that, for lack of time: give it a larger budget"
 )
 _CLOSED = (
     "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
@@ -52,7 +52,11 @@ ONE_WAY = (
     "nothing was held out, since most of that would have been at voltages through which the rest does not go both "
     "ways, where no fit predicts anything: the gain is not measured"
 )
-_RUNS: dict[Hold, tuple[str, str]] = {"smooth": ("along curves", _CURVES), "zero": ("held in steps", _STEPS)}
+_WORDS: dict[Hold, tuple[str, str]] = {
+    "first": (_LINES, "run in lines"),
+    "smooth": (_CURVES, "run along curves"),
+    "zero": (_STEPS, "be held"),
+}
 
 
 @dataclass(frozen=True)
@@ -84,96 +88,6 @@ class Prepared:
     skipped: tuple[tuple[str, str], ...]
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """The plain stage, fitted to runs in one way."""
-
-    regression: Regression
-    faults: Faults
-
-    @cached_property
-    def projector(self) -> Projector:
-        return Projector(self.regression, self.faults.noise).bounded()
-
-    @cached_property
-    def bench(self) -> Bench:
-        return Bench(self.regression.baseline)
-
-    @cached_property
-    def scales(self) -> Scales:
-        return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise))
-
-    @cached_property
-    def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
-        return _probed(self.bench, self.scales, self.projector)
-
-    @cached_property
-    def left(self) -> np.ndarray:
-        """What the stage leaves, whitened and joined."""
-        return self.projector.off(self.projector.residual)
-
-    def late(self, left: np.ndarray | None = None) -> tuple[float, float]:
-        """Decrease of that, or of what is `left` otherwise, by a delay, and the delay in s."""
-        left = self.left if left is None else left
-        form = next(form for form in EFFECTS if form.delay)
-        scores = score(self.projector, list(probes_of(self.bench, form, self.scales)), left).each
-        if not scores:
-            return 0.0, 0.0
-        best = max(scores, key=lambda one: one.drop)
-        return best.drop, float(best.coefficients[0] * getattr(best.probe.effects[0], form.delay))
-
-    def delay_drop(self, left: np.ndarray | None = None) -> float:
-        """The same decrease, if that is a delay and no lead."""
-        drop, late_s = self.late(left)
-        return drop if late_s > 0 else 0.0
-
-    def left_under(self, hold: Hold) -> np.ndarray:
-        """What is left with the command in another way between samples, the stage following along its tangent."""
-        baseline = self.regression.baseline
-        here, there = baseline.stage, baseline.stage.with_hold(hold)
-        change = [simulate(there, replace(run, hold=hold)) - simulate(here, run) for run in baseline.finest]
-        return self.projector.off(self.projector.residual - self.projector.join(change))
-
-    def prefers(self, hold: Hold, thresholds: Thresholds) -> bool:
-        """Whether there is evidence for another command between samples.
-
-        Curves must leave less than lines beyond chance. Steps must explain what a delay behind lines does. Either
-        must explain more with the best effect beside it than lines do.
-        """
-        least, off = thresholds.other_hold_z**2, thresholds.model_error
-        late = self.delay_drop() if hold == "zero" else np.inf
-        if late <= least:
-            return False
-        left = self.left_under(hold)
-        gained = float(self.left @ self.left - left @ left)
-        best, beside = self.largest_z() ** 2, gained + self.largest_z(left) ** 2
-        if hold == "zero":
-            explains = gained > (1 - off) * late or gained - late + self.delay_drop(left) > off * late
-            return explains and beside > (1 - off) * best
-        return gained > least and beside > best
-
-    def left_beside_lag(self) -> float:
-        """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""
-        probe = next((probe for probe in self.probed[0] if probe.form.lag), None)
-        if probe is None:
-            return np.inf
-        law = Law([probe.effects[0]] * len(self.regression.baseline.runs))
-        model = refit(self.bench, self.projector, [law], [law.start], 0)
-        ends = fit_from_poles(self.bench, self.projector, model)
-        return min((end[-1].cost for end in ends), default=np.inf)
-
-    def outdoes(self, other: "_Fit") -> bool:
-        """Whether a lag of the reading leaves less here than another fit does with the best effect beside it."""
-        there = Projector(other.regression, self.faults.noise).bounded()
-        left = there.off(there.residual)
-        return self.left_beside_lag() < float(left @ left) - other.largest_z() ** 2
-
-    def largest_z(self, left: np.ndarray | None = None) -> float:
-        """Evidence of the effect that has most, in what is `left`."""
-        scores = score(self.projector, self.probed[0], self.left if left is None else left).each
-        return max((one.z for one in scores), default=0.0)
-
-
 def prepare_diagnosis(
     reading: Reading, progress: Callable[[str], None], has_time: Callable[[], bool] = lambda: True
 ) -> Prepared:
@@ -186,45 +100,44 @@ def prepare_diagnosis(
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
 
-    def fitted(hold: Hold, onward: Problem | None = None) -> _Fit:
-        settings = reading.aside, fraction, initial, progress, hold
+    def fitted(holds: Holds, onward: Problem | None = None) -> PlainFit:
+        settings = reading.aside, fraction, initial, progress, holds, reading.thresholds.other_hold_z
         regression = regress(fit_baseline(records, *settings, onward))
         faults = find_faults(regression, None, reading.thresholds)
         if not faults.repaired:
-            return _Fit(regression, faults)
+            return PlainFit(regression, faults)
         progress("fitting the plain stage again, without single bad samples")
         regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem))
         found = find_faults(regression, None, reading.thresholds)
-        return _Fit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
+        return PlainFit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
     progress(Step.BASELINE)
-    here = fitted("first")
+    here = fitted(())
     drop_programs(records)
     progress(Step.PROBES)
-    taken = ""
-    for hold, (words, remark) in _RUNS.items():
-        if here.regression.baseline.dynamic and here.prefers(hold, reading.thresholds):
-            if not has_time():
-                said = (*said, _NOT_ASKED.format(words))
-                break
-            progress(f"fitting the plain stage again, its command {words}")
+    if here.regression.baseline.dynamic:
+        holds = here.better_holds(reading.thresholds)
+        if {*holds} != {"first"} and not has_time():
+            said = (*said, _NOT_ASKED)
+        elif {*holds} != {"first"}:
+            progress("fitting the plain stage again, its command in another way between samples")
             drop_programs(records)
-            other = fitted(hold, here.regression.baseline.problem)
+            other = fitted(holds, here.regression.baseline.problem)
             # What comes late at a sensor looks like a command that does so between samples.
             if not here.outdoes(other):
-                here, taken = other, remark
+                here = other
             drop_programs(records)
-    said = (*said, taken) if taken else said
+        said = (*said, *_of_holds(here.regression.baseline))
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if (
             drop > max(reading.thresholds.other_hold_z**2, (_ABOUT * here.largest_z()) ** 2)
             and late_s < _SKEW * here.scales.interval_s
         ):
-            here = _Fit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
+            here = PlainFit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
             said = (*said, _SKEWED.format(late_s))
     if here.faults.jitter_s > 0:
-        here = _Fit(regress(replace(here.regression.baseline, blurred=True)), here.faults)
+        here = PlainFit(regress(replace(here.regression.baseline, blurred=True)), here.faults)
     regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
     if all(held_gain([record]) is not None for record in records):
         shut = dict.fromkeys(one.name for one in probes if not one.form.held)
@@ -243,6 +156,17 @@ def prepare_diagnosis(
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
 
 
+def _of_holds(baseline: Baseline) -> list[str]:
+    """Say how commands are taken to go between samples, where not all of them run in lines."""
+    said, usual = [], baseline.stage.hold
+    each = {run.hold for run in baseline.runs}
+    for hold in sorted(each) if each != {"first"} else []:
+        of = "" if len(each) == 1 else " of " + ", ".join(r.record.source for r in baseline.runs if r.hold == hold)
+        said.append(_WORDS[hold][0].format(of))
+    others = [run for run in baseline.aside if run.hold != usual]
+    return said + [_ASIDE.format(run.record.source, _WORDS[run.hold][1]) for run in others]
+
+
 def _covered(records: Sequence[Record], fraction: float) -> bool:
     """Whether most of what is held out is at voltages through which the rest goes up and down; of all, if nothing."""
     kept = [len(record) - round(fraction * len(record)) for record in records]
@@ -258,20 +182,3 @@ def _covered(records: Sequence[Record], fraction: float) -> bool:
             return False
         inside &= (np.concatenate(asked) >= passed_V.min()) & (np.concatenate(asked) <= passed_V.max())
     return float(np.mean(inside)) > _HALF
-
-
-def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
-    """Simulate every probe of every effect that can be asked about, and say of the others why not."""
-    probes: list[Probe] = []
-    skipped = []
-    for form in EFFECTS:
-        reason = applicable(bench.baseline, form)
-        if reason is not None:
-            skipped.append((form.name, reason))
-            continue
-        found = list(probes_of(bench, form, scales, projector))
-        if not found:
-            why = "the runs are too short or too plain to show it"
-            skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))
-        probes += found
-    return probes, skipped

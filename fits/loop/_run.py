@@ -38,8 +38,8 @@ class Samples(eqx.Module):
 
     `time_s` is the one interval between steps where they are even. `weight` is that of each sample in the sum of
     squares, 0 where it is not fitted. `moving` says whether the stage may have been moving when the record began, and
-    `has_past` whether the unknown memory of its hysteresis is estimated. `beside` holds further columns under the
-    names of `columns_beside`.
+    `has_past` whether the unknown memory of its hysteresis is estimated. Between samples the command runs as `hold`
+    says, whatever that of a stage is. `beside` holds further columns under the names of `columns_beside`.
     """
 
     time_s: Float[Array, " m"] | Float[Array, ""]
@@ -50,6 +50,7 @@ class Samples(eqx.Module):
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
     has_past: bool = eqx.field(static=True)
+    hold: m.Hold = eqx.field(static=True)
     beside: dict[str, Float[Array, " m"]] = eqx.field(default_factory=dict)
 
 
@@ -154,6 +155,7 @@ class Run:
             stride=stride,
             moving=self.moving,
             has_past=self.has_past,
+            hold=self.hold,
             beside={name: jnp.asarray(values) for name, values in beside.items()},
         )
 

@@ -131,7 +131,7 @@ def fit_without_delays(
     """
     # Between two samples a command in steps has no place where it could be shifted to, and without a resonance to
     # measure it by a delay is part of the lag.
-    if plan.hold == "zero":
+    if "zero" in plan.holds:
         return None
     start = solved.onward
     if start.least_noise_share:

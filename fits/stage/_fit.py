@@ -165,11 +165,13 @@ def solve_stage(
     accept_best: bool = False,
     estimated: bool = False,
     onward: Problem | None = None,
+    holds: Sequence[m.Hold] = (),
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
     `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
     adds may be `estimated` beside the rest. The fit goes `onward` from another one, or begins where the runs say.
+    Commands run between samples as the stage says, or each as one of `holds`.
     """
     fraction, _, range_V = check_fit(records, holdout, loss, levels)
     for record in records:
@@ -185,7 +187,8 @@ def solve_stage(
             "insert one, or use hold='first'"
         )
     plan = Plan(
-        *(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage), stage.hold),
+        *(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage)),
+        tuple(holds) or (stage.hold,) * len(records),
         accept_best=accept_best,
         estimated=estimated,
     )

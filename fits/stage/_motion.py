@@ -26,7 +26,7 @@ class Prepared:
 
 def prepare(stage: Stage, run: Run) -> Prepared:
     samples = run.samples
-    command = Signal(samples.voltage_V, samples.voltage_V[0], stage.hold)
+    command = Signal(samples.voltage_V, samples.voltage_V[0], samples.hold)
     return Prepared(run, Scene(command, samples.beside, samples.start.memory))
 
 

@@ -27,6 +27,7 @@ _TINY = 1e-12
 def respond(stage: m.Stage, samples: Samples) -> Float[Array, " n"]:
     """Simulate a run, in um, shape `(n,)`."""
     start = samples.start if any(isinstance(m.innermost(part), m.Preisach) for part in stage.parts) else m.Start()
+    stage = stage.with_hold(samples.hold)
     return stage(samples.time_s, samples.voltage_V, start, samples.beside)[:: samples.stride]
 
 
@@ -150,7 +151,7 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
 @kept
 def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> Float[Array, " m"]:
     """What goes into a part after a rest at the first command, or at another, at the refined times, `(m,)`."""
-    signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, stage.hold)
+    signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, samples.hold)
     scene = m.Scene(signal, samples.beside, samples.start.memory)
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal, scene)
@@ -165,6 +166,7 @@ def yields_inside(stage: m.Stage) -> bool:
 @kept
 def _after_rest(stage: m.Stage, samples: Samples, rest_V: Float[Array, ""]) -> Float[Array, " n"]:
     """Response after a rest at some command, in um, `(n,)`."""
+    stage = stage.with_hold(samples.hold)
     return stage(samples.time_s, samples.voltage_V, m.Start(rest_V), samples.beside)[:: samples.stride]
 
 

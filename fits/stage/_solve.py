@@ -25,6 +25,10 @@ _ROUNDS, _ROUGH = 40, 12
 _FACTOR, _HIGHEST = 10.0, 1e6
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
 _STATIONARY = 0.02
+# A run is given up where this many times as much is left of it, since neighbouring samples of it agree.
+_GIVEN_UP = 2.0
+# For those who go on from the best place, the logarithm of the likelihood must rise by this much in so many rounds.
+_FALLS, _PATIENCE = 0.5, 6
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,10 @@ class Weighing:
             correlation.append(correlation_samples([left]))
         each = float(np.exp(np.mean(np.log(correlation))))
         return cls(tuple(noise), tuple(correlation), counted or (each,) * len(noise))
+
+    def gives_up(self, other: "Weighing") -> bool:
+        """Whether some run is left much more of than by another fit, as where a model is wrong for it."""
+        return any(now > _GIVEN_UP * then for now, then in zip(self.noise_um, other.noise_um, strict=True))
 
     def alike(self) -> "Weighing":
         """As if all runs had the same noise, and no sample any of another."""
@@ -143,8 +151,7 @@ class Solved:
     @property
     def cost(self) -> float:
         """Logarithm of the noise that is left, times the samples that count: smaller is better."""
-        terms = zip(self.runs, self.weighing.noise_um, strict=True)
-        return sum(float(run.fitted.sum()) * float(np.log(noise)) for run, noise in terms)
+        return _cost(self.runs, self.weighing)
 
 
 def solve_chain(
@@ -164,11 +171,20 @@ def solve_chain(
     z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
     damping = 1e-4
     counted: tuple[float, ...] = ()
+    settled: Solved | None = None
+    best, last = np.inf, 0
     for number in range(_ROUGH if rough else _ROUNDS):
         runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
+        if settled is not None and weighing.gives_up(settled.weighing):
+            return settled
+        if (cost := _cost(runs, weighing)) < best - _FALLS:
+            best, last = cost, number
+        if accept_best and number >= last + _PATIENCE:
+            # Smoothness and noise take turns.
+            break
         # Far from the answer, what a run leaves says nothing of its noise: weighed by it, one run would be given up.
         weights = weighing.alike() if rough else weighing
         total = weights.total(sums)
@@ -208,6 +224,7 @@ def solve_chain(
         if distance < _STATIONARY and not rough and not counted and len(runs) > 1:
             # What is fitted worse is correlated more: run after run would be given up if this were asked again.
             counted = weighing.correlation
+            settled = Solved(problem, z, columns_um, hyper, runs, sums, weighing)
             continue
         if distance < _STATIONARY:
             runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
@@ -249,6 +266,11 @@ def _gather(
     sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
     weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
     return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)
+
+
+def _cost(runs: Sequence[Run], weighing: Weighing) -> float:
+    terms = zip(runs, weighing.noise_um, strict=True)
+    return sum(float(run.fitted.sum()) * float(np.log(noise)) for run, noise in terms)
 
 
 def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run]) -> list[np.ndarray]:

@@ -41,7 +41,8 @@ _FINEST = 16
 class Plan:
     """What was asked for, and whether an unknown past is `estimated`.
 
-    Commands come `shifts_s` later, and samples that have `settled`, `(n,)`, are fitted.
+    The command of each record runs between samples as `holds` say, and comes `shifts_s` later; samples that have
+    `settled`, `(n,)`, are fitted.
     """
 
     records: tuple[Record, ...]
@@ -51,7 +52,7 @@ class Plan:
     loss: str
     progress: Progress
     gain: float | None
-    hold: Hold
+    holds: tuple[Hold, ...]
     accept_best: bool
     estimated: bool = False
     shifts_s: tuple[float, ...] = ()
@@ -77,7 +78,7 @@ class Plan:
             usable = there if usable is None else there & usable
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later)
-        settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.hold
+        settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.holds[k]
         return prepare_run(record, *settings, usable, self.estimated)
 
     def behind(self, solved: Solved) -> "Plan | None":
@@ -287,7 +288,7 @@ def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
     """
     stage = solved.stage
     quick = [each for each in named_parts(stage, Driver) if float(each[1].time_constant_s) < 1e-2 * plan.interval_s]
-    if plan.hold != "zero" or not quick:
+    if "zero" not in plan.holds or not quick:
         return solved.z
     for name, part in quick:
         stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))

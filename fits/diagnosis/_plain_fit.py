@@ -1,0 +1,174 @@
+"""A plain stage fitted to runs, their command in one way between samples, and whether the runs show another way."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+
+import numpy as np
+
+from fits.diagnosis._baseline import simulate
+from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._joint_fit import fit_from_poles
+from fits.diagnosis._noise import Faults
+from fits.diagnosis._projector import Projector
+from fits.diagnosis._refit import refit
+from fits.diagnosis._regression import Regression
+from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
+from fits.diagnosis._thresholds import Thresholds
+from microid import Hold
+from microid.effects import EFFECTS, Scales
+
+Holds = tuple[Hold, ...]
+_HOLDS: Holds = "first", "smooth", "zero"
+# What is left exceeds noise by no more than this part of it.
+_NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class PlainFit:
+    """The plain stage, fitted to runs in one way."""
+
+    regression: Regression
+    faults: Faults
+
+    @cached_property
+    def projector(self) -> Projector:
+        return Projector(self.regression, self.faults.noise).bounded()
+
+    @cached_property
+    def bench(self) -> Bench:
+        return Bench(self.regression.baseline)
+
+    @cached_property
+    def scales(self) -> Scales:
+        return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise))
+
+    @cached_property
+    def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
+        """Probes of every effect that can be asked about, and why the others cannot be."""
+        return _probed(self.bench, self.scales, self.projector)
+
+    @cached_property
+    def left(self) -> np.ndarray:
+        """What the stage leaves, whitened and joined."""
+        return self.projector.off(self.projector.residual)
+
+    @cached_property
+    def _delays(self) -> list[Probe]:
+        form = next(form for form in EFFECTS if form.delay)
+        return list(probes_of(self.bench, form, self.scales))
+
+    def late(self, left: np.ndarray | None = None) -> tuple[float, float]:
+        """Decrease of that, or of what is `left` otherwise, by a delay, and the delay in s."""
+        scores = score(self.projector, self._delays, self.left if left is None else left).each
+        if not scores:
+            return 0.0, 0.0
+        best = max(scores, key=lambda one: one.drop)
+        return best.drop, float(best.coefficients[0] * getattr(best.probe.effects[0], best.probe.form.delay))
+
+    def delay_drop(self, left: np.ndarray) -> float:
+        """The same decrease, if that is a delay and no lead."""
+        drop, late_s = self.late(left)
+        return drop if late_s > 0 else 0.0
+
+    def largest_z(self, left: np.ndarray | None = None) -> float:
+        """Evidence of the effect that has most, in what is `left`."""
+        scores = score(self.projector, self.probed[0], self.left if left is None else left).each
+        return max((one.z for one in scores), default=0.0)
+
+    @cached_property
+    def _under(self) -> list[dict[Hold, np.ndarray]]:
+        """What another command between the samples of each run changes, the stage following along its tangent."""
+        baseline, found = self.regression.baseline, []
+        for k, run in enumerate(baseline.finest):
+            here, each = simulate(baseline.stage, run), dict[Hold, np.ndarray]()
+            for hold in _HOLDS[1:]:
+                change = [np.zeros(len(one.record)) for one in baseline.finest]
+                change[k] = simulate(baseline.stage, replace(run, hold=hold)) - here
+                each[hold] = self.projector.off(self.projector.join(change))
+            found.append({"first": np.zeros_like(self.left), **each})
+        return found
+
+    def left_under(self, holds: Sequence[Hold]) -> np.ndarray:
+        """What is left with the command of each run in some way between samples."""
+        found: np.ndarray = self.left - sum(each[hold] for each, hold in zip(self._under, holds, strict=True))
+        return found
+
+    def better_holds(self, thresholds: Thresholds) -> Holds:
+        """How the command of each run goes between samples, in lines unless there is evidence for another way.
+
+        Curves must leave less than lines beyond chance. Steps must explain what a delay behind the others does.
+        Together they must explain more with the best effect beside them than lines do.
+        """
+        least, off = thresholds.other_hold_z**2, thresholds.model_error
+        lines = _HOLDS[:1] * len(self._under)
+        whole = float(self.left @ self.left)
+
+        def gained(holds: Holds) -> float:
+            left = self.left_under(holds)
+            return whole - float(left @ left)
+
+        @cache
+        def delayed(holds: Holds) -> float:
+            return self.delay_drop(self.left_under(holds))
+
+        def worth(holds: Holds) -> float:
+            # A delay beside them is one cause more.
+            return gained(holds) + (1 - off) * delayed(holds) - least * sum(hold != "first" for hold in holds)
+
+        found = max((_climbed(worth, (hold,) * len(lines)) for hold in _HOLDS), key=worth)
+        if "zero" in found:
+            without = tuple(_HOLDS[0] if hold == "zero" else hold for hold in found)
+            late, more = delayed(without), gained(found) - gained(without)
+            if late <= least or not (more > (1 - off) * late or more + delayed(found) - late > off * late):
+                found = _climbed(worth, without, _HOLDS[:2])
+        if found == lines or gained(found) <= least:
+            return lines
+        best, beside_z = self.largest_z(), self.largest_z(self.left_under(found))
+        share = 1 - off if "zero" in found else 1.0
+        return found if gained(found) + beside_z**2 > share * best**2 else lines
+
+    def left_beside_lag(self) -> float:
+        """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""
+        probe = next((probe for probe in self.probed[0] if probe.form.lag), None)
+        if probe is None:
+            return np.inf
+        law = Law([probe.effects[0]] * len(self.regression.baseline.runs))
+        model = refit(self.bench, self.projector, [law], [law.start], 0)
+        ends = fit_from_poles(self.bench, self.projector, model)
+        return min((end[-1].cost for end in ends), default=np.inf)
+
+    def outdoes(self, other: "PlainFit") -> bool:
+        """Whether a lag of the reading leaves less here than another fit does with the best effect beside it."""
+        there = Projector(other.regression, self.faults.noise).bounded()
+        left = there.off(there.residual)
+        rest = float(left @ left) - other.largest_z() ** 2
+        # Of noise alone nothing would leave less.
+        return rest > (1 + _NOISE) * len(left) and self.left_beside_lag() < rest
+
+
+def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLDS) -> Holds:
+    """Change one hold at a time, that which is worth most, for as long as that is worth more."""
+    while True:
+        others = [(*holds[:k], hold, *holds[k + 1 :]) for k in range(len(holds)) for hold in among]
+        best = max(others, key=worth)
+        if worth(best) <= worth(holds):
+            return holds
+        holds = best
+
+
+def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
+    """Simulate every probe of every effect that can be asked about, and say of the others why not."""
+    probes: list[Probe] = []
+    skipped = []
+    for form in EFFECTS:
+        reason = applicable(bench.baseline, form)
+        if reason is not None:
+            skipped.append((form.name, reason))
+            continue
+        found = list(probes_of(bench, form, scales, projector))
+        if not found:
+            why = "the runs are too short or too plain to show it"
+            skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))
+        probes += found
+    return probes, skipped
