@@ -125,14 +125,14 @@ def fit_baseline(
     initial: str,
     progress: Callable[[str], None],
     holds: Sequence[Hold] = (),
-    aside_z: float = np.inf,
+    better: float = np.inf,
     onward: Problem | None = None,
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
     `holds` say how the commands of `records` run between samples, as in `Stage`, in lines by default. Those of
-    `aside` run as most of these do, unless they are predicted better otherwise by `aside_z` standard deviations. The
-    fit goes `onward` from one that was made.
+    `aside` run as these do, unless that part of their error goes otherwise. The fit goes `onward` from one that was
+    made.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def fit_baseline(
         return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
     asked = _prepared(aside, range_V, initial, 0.0, _FINE, False)
-    held_holds = [_hold_of(solved.stage, run, aside_z) for run in asked]
+    held_holds = [_hold_of(solved.stage, run, better) for run in asked]
     # What a step starts is over soon, and slow runs sample it sparsely.
     many = _FINE_STEPS if "zero" in (*holds, *held_holds) else _FINE
     (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
@@ -225,18 +225,18 @@ def _prepared(
     return tuple(prepare_run(record, *settings, hold=hold, estimated=estimated) for record, hold in each)
 
 
-def _hold_of(stage: Stage, run: Run, least_z: float) -> Hold:
+def _hold_of(stage: Stage, run: Run, least: float) -> Hold:
     """How the command of a run seems to go between samples, by what a stage that was fitted to others predicts.
 
-    As in the others unless there is evidence, which is asked of fast changes: there slow errors are small.
+    As in the others unless another way takes off the least part of the fast changes that are left; slow errors of the
+    stage are small there.
     """
     found: dict[Hold, float] = {}
     for hold in get_args(Hold):
         left = run.displacement_um - simulate(stage, replace(run, hold=hold))
         found[hold] = float(np.sum(np.diff(left[run.known]) ** 2))
     best = min(found, key=lambda hold: found[hold])
-    gained = run.known.sum() * np.log(found[stage.hold] / max(found[best], 1e-300))
-    return best if gained > least_z**2 else stage.hold
+    return best if found[best] < (1 - least) * found[stage.hold] else stage.hold
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:

@@ -19,6 +19,7 @@ from microid import Hold
 from microid.effects import EFFECTS, Scales
 
 Holds = tuple[Hold, ...]
+IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
 # What is left exceeds noise by no more than this part of it.
 _NOISE = 0.05
@@ -30,6 +31,11 @@ class PlainFit:
 
     regression: Regression
     faults: Faults
+
+    @property
+    def holds(self) -> Holds:
+        """How the command of each run is taken to go between samples."""
+        return tuple(run.hold for run in self.regression.baseline.runs)
 
     @cached_property
     def projector(self) -> Projector:
@@ -82,11 +88,12 @@ class PlainFit:
         baseline, found = self.regression.baseline, []
         for k, run in enumerate(baseline.finest):
             here, each = simulate(baseline.stage, run), dict[Hold, np.ndarray]()
-            for hold in _HOLDS[1:]:
+            for hold in _HOLDS:
                 change = [np.zeros(len(one.record)) for one in baseline.finest]
-                change[k] = simulate(baseline.stage, replace(run, hold=hold)) - here
+                if hold != run.hold:
+                    change[k] = simulate(baseline.stage, replace(run, hold=hold)) - here
                 each[hold] = self.projector.off(self.projector.join(change))
-            found.append({"first": np.zeros_like(self.left), **each})
+            found.append(each)
         return found
 
     def left_under(self, holds: Sequence[Hold]) -> np.ndarray:
@@ -95,13 +102,13 @@ class PlainFit:
         return found
 
     def better_holds(self, thresholds: Thresholds) -> Holds:
-        """How the command of each run goes between samples, in lines unless there is evidence for another way.
+        """How the command of each run goes between samples, as it was taken unless there is evidence for another way.
 
         Curves must leave less than lines beyond chance. Steps must explain what a delay behind the others does.
-        Together they must explain more with the best effect beside them than lines do.
+        Together they must explain more with the best effect beside them than those that were taken.
         """
         least, off = thresholds.other_hold_z**2, thresholds.model_error
-        lines = _HOLDS[:1] * len(self._under)
+        taken = self.holds
         whole = float(self.left @ self.left)
 
         def gained(holds: Holds) -> float:
@@ -114,19 +121,35 @@ class PlainFit:
 
         def worth(holds: Holds) -> float:
             # A delay beside them is one cause more.
-            return gained(holds) + (1 - off) * delayed(holds) - least * sum(hold != "first" for hold in holds)
+            others = sum(hold != own for hold, own in zip(holds, taken, strict=True))
+            return gained(holds) + (1 - off) * delayed(holds) - least * others
 
-        found = max((_climbed(worth, (hold,) * len(lines)) for hold in _HOLDS), key=worth)
-        if "zero" in found:
+        starts = taken, *((hold,) * len(taken) for hold in _HOLDS)
+        found = max((_climbed(worth, start) for start in starts), key=worth)
+        if {*found} - {*taken} >= {"zero"}:
             without = tuple(_HOLDS[0] if hold == "zero" else hold for hold in found)
             late, more = delayed(without), gained(found) - gained(without)
             if late <= least or not (more > (1 - off) * late or more + delayed(found) - late > off * late):
                 found = _climbed(worth, without, _HOLDS[:2])
-        if found == lines or gained(found) <= least:
-            return lines
+        if found == taken or gained(found) <= least:
+            return taken
         best, beside_z = self.largest_z(), self.largest_z(self.left_under(found))
         share = 1 - off if "zero" in found else 1.0
-        return found if gained(found) + beside_z**2 > share * best**2 else lines
+        return found if gained(found) + beside_z**2 > share * best**2 else taken
+
+    def may_step(self, thresholds: Thresholds) -> bool:
+        """Whether more than noise is left, and part of that is late, so that all commands may go in steps.
+
+        A resonance fitted beside lines may have taken up most of how late they are.
+        """
+        far = float(self.left @ self.left) > (1 + _NOISE) * len(self.left)
+        return "zero" not in self.holds and far and self.delay_drop(self.left) > thresholds.other_hold_z**2
+
+    def leaves_less(self, other: "PlainFit") -> bool:
+        """Whether less is left here than another fit leaves beside the best effect."""
+        here = Projector(self.regression, other.faults.noise).bounded()
+        left = here.off(here.residual)
+        return float(left @ left) < float(other.left @ other.left) - other.largest_z() ** 2
 
     def left_beside_lag(self) -> float:
         """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""

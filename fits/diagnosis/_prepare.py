@@ -9,7 +9,7 @@ from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._plain_fit import Holds, PlainFit
+from fits.diagnosis._plain_fit import IN_STEPS, Holds, PlainFit
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
@@ -46,6 +46,8 @@ _CLOSED = (
     "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
     "only along the way that it took"
 )
+# Part of the intervals in which a command in steps stays where it is.
+_MOST = 0.5
 # Part of the samples held out at voltages through which it goes both ways in what is fitted.
 _HALF = 0.5
 ONE_WAY = (
@@ -101,7 +103,7 @@ def prepare_diagnosis(
         fraction, said = 0.0, (*said, ONE_WAY)
 
     def fitted(holds: Holds, onward: Problem | None = None) -> PlainFit:
-        settings = reading.aside, fraction, initial, progress, holds, reading.thresholds.other_hold_z
+        settings = reading.aside, fraction, initial, progress, holds, reading.thresholds.model_error
         regression = regress(fit_baseline(records, *settings, onward))
         faults = find_faults(regression, None, reading.thresholds)
         if not faults.repaired:
@@ -112,20 +114,24 @@ def prepare_diagnosis(
         return PlainFit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
 
     progress(Step.BASELINE)
-    here = fitted(())
+    here = fitted(tuple(map(_hold_of_plateaus, records)))
     drop_programs(records)
     progress(Step.PROBES)
     if here.regression.baseline.dynamic:
         holds = here.better_holds(reading.thresholds)
-        if {*holds} != {"first"} and not has_time():
+        steps = holds == here.holds and here.may_step(reading.thresholds)
+        if (steps or holds != here.holds) and not has_time():
             said = (*said, _NOT_ASKED)
-        elif {*holds} != {"first"}:
+        elif steps or holds != here.holds:
             progress("fitting the plain stage again, its command in another way between samples")
             drop_programs(records)
-            other = fitted(holds, here.regression.baseline.problem)
-            # What comes late at a sensor looks like a command that does so between samples.
-            if not here.outdoes(other):
-                here = other
+            if steps:
+                other = fitted(IN_STEPS * len(records))
+                here = other if other.leaves_less(here) else here
+            else:
+                other = fitted(holds, here.regression.baseline.problem)
+                # What comes late at a sensor looks like a command that does so between samples.
+                here = here if here.outdoes(other) else other
             drop_programs(records)
         said = (*said, *_of_holds(here.regression.baseline))
     if here.regression.baseline.dynamic:
@@ -154,6 +160,11 @@ def prepare_diagnosis(
     projector = Projector(regression, faults.noise, rough).bounded()
     projector = projector.beside(with_discrepancy(projector, candidates)).bounded()
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+
+
+def _hold_of_plateaus(record: Record) -> Hold:
+    """Steps where a command stays where it is most of the time, lines otherwise."""
+    return "zero" if float(np.mean(np.diff(record.voltage_V) == 0)) > _MOST else "first"
 
 
 def _of_holds(baseline: Baseline) -> list[str]:

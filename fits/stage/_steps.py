@@ -11,7 +11,7 @@ import numpy as np
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
-from fits.loop._misfit import without_impulses
+from fits.loop._misfit import misfits, without_impulses
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run, prepare_run, simulate_run
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
@@ -185,11 +185,22 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        if not plan.accept_best and fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
-            return lagging
-        if not plan.accept_best or (beside := _beside_lag(plan, problem, runs, responses)) is None:
+        if not plan.accept_best:
+            if fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
+                return lagging
             raise
-        refuse_unidentifiable(beside, drives, fast=fast != slow)
+        lagged = _without_mechanics(plan, solved, asked, levels, finest, runs)
+        if lagged is not None and not any(one.far for one in misfits(runs, lagged.residuals_um)):
+            return lagged.onward
+        try:
+            if (beside := _beside_lag(plan, problem, runs, responses)) is None:
+                raise
+            refuse_unidentifiable(beside, drives, fast=fast != slow)
+        except DataError:
+            if lagged is None:
+                raise
+            return lagged.onward
+        assert beside is not None
         poles = problem.chain.coordinates.of(beside.stage.without(beside.stage.names[-1]))
         return replace(problem, z=np.asarray(poles), columns_um=beside.columns_um)
     if dropped is not None:
@@ -198,6 +209,24 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         remarks = (_no_resonance(plan, dropped), *simpler.remarks)
         return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
+
+
+def _without_mechanics(
+    plan: Plan, solved: Solved, asked: Stage, levels: int | None, finest: int, runs: list[Run]
+) -> Solved | None:
+    """Fit driver and hysteresis to runs that show no resonance; None where they show no lag either."""
+    modes, drivers = named_parts(asked, Mechanics), named_parts(asked, Driver)
+    if len(modes) != 1 or not drivers:
+        return None
+    dropped = modes[0][0]
+    plan.progress("a lag without a resonance")
+    try:
+        problem = start_problem(plan, asked.without(dropped), levels, finest)
+    except DataError:
+        return None
+    remarks = (_no_resonance(plan, dropped), *problem.remarks)
+    problem = replace(problem, least_noise_share=_EVEN, remarks=remarks, full=solved)
+    return try_chain(problem, runs, plan.loss, plan.progress, accept_best=True)
 
 
 def _beside_lag(
