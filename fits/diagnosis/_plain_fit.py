@@ -131,11 +131,20 @@ class PlainFit:
             late, more = delayed(without), gained(found) - gained(without)
             if late <= least or not (more > (1 - off) * late or more + delayed(found) - late > off * late):
                 found = _climbed(worth, without, _HOLDS[:2])
-        if found == taken or gained(found) <= least:
-            return taken
-        best, beside_z = self.largest_z(), self.largest_z(self.left_under(found))
-        share = 1 - off if "zero" in found else 1.0
-        return found if gained(found) + beside_z**2 > share * best**2 else taken
+        best = self.largest_z() ** 2
+
+        def beside(holds: Holds) -> float:
+            return gained(holds) + self.largest_z(self.left_under(holds)) ** 2
+
+        if found != taken and gained(found) > least:
+            share = 1 - off if "zero" in found else 1.0
+            return found if beside(found) > share * best else taken
+        # A large effect may hide between the samples what only shows beside it.
+        curves = [
+            tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in _some(len(taken))
+        ]
+        found = max(curves, key=beside)
+        return found if beside(found) > best + least else taken
 
     def may_step(self, thresholds: Thresholds) -> bool:
         """Whether more than noise is left, and part of that is late, so that all commands may go in steps.
@@ -143,7 +152,8 @@ class PlainFit:
         A resonance fitted beside lines may have taken up most of how late they are.
         """
         far = float(self.left @ self.left) > (1 + _NOISE) * len(self.left)
-        return "zero" not in self.holds and far and self.delay_drop(self.left) > thresholds.other_hold_z**2
+        most = max(thresholds.other_hold_z**2, (1 - thresholds.model_error) * self.largest_z() ** 2)
+        return "zero" not in self.holds and far and self.delay_drop(self.left) > most
 
     def leaves_less(self, other: "PlainFit") -> bool:
         """Whether less is left here than another fit leaves beside the best effect."""
@@ -168,6 +178,11 @@ class PlainFit:
         rest = float(left @ left) - other.largest_z() ** 2
         # Of noise alone nothing would leave less.
         return rest > (1 + _NOISE) * len(left) and self.left_beside_lag() < rest
+
+
+def _some(count: int) -> list[set[int]]:
+    """Each run alone, and all of them."""
+    return [{k} for k in range(count)] + [set(range(count))]
 
 
 def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLDS) -> Holds:

@@ -189,7 +189,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             if fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
                 return lagging
             raise
-        lagged = _without_mechanics(plan, solved, asked, levels, finest, runs)
+        lagged = None if fast == slow else _without_mechanics(plan, solved, asked, levels, finest, runs)
         if lagged is not None and not any(one.far for one in misfits(runs, lagged.residuals_um)):
             return lagged.onward
         try:
@@ -222,7 +222,7 @@ def _without_mechanics(
     plan.progress("a lag without a resonance")
     try:
         problem = start_problem(plan, asked.without(dropped), levels, finest)
-    except DataError:
+    except (DataError, FitError, np.linalg.LinAlgError):
         return None
     remarks = (_no_resonance(plan, dropped), *problem.remarks)
     problem = replace(problem, least_noise_share=_EVEN, remarks=remarks, full=solved)
