@@ -5,20 +5,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fits.diagnosis._prepare import _Fit
+from fits.diagnosis._plain_fit import PlainFit
+from fits.diagnosis._prepare import _hold_of_plateaus
 from fits.diagnosis._thresholds import THRESHOLDS
 
 
 def prefers(hold, lines, other, late, late_after=0.0, best=None, best_after=0.0):
     """Of costs under lines and under the other, what a delay takes off either, and what the best effect does."""
-    left, after = np.array([lines**0.5]), np.array([other**0.5])
+    left, after, bad = (np.array([cost**0.5]) for cost in (lines, other, 1e6))
+
+    def largest_z(at=left):
+        return (max(best_after, late_after) if at is after else max(best or 0.0, late) * (at is left)) ** 0.5
+
     fit = SimpleNamespace(
+        holds=("first",),
         left=left,
-        left_under=lambda _: after,
-        delay_drop=lambda at=None: late if at is None else late_after,
-        largest_z=lambda at=None: (max(best or 0.0, late) if at is None else max(best_after, late_after)) ** 0.5,
+        left_under=lambda holds: {"first": left, hold: after}.get(holds[0], bad),
+        delay_drop=lambda at: late_after if at is after else late * (at is left),
+        largest_z=largest_z,
     )
-    return _Fit.prefers(fit, hold, THRESHOLDS)
+    return PlainFit.better_holds(fit, THRESHOLDS) == (hold,)
 
 
 def test_steps_are_taken_that_explain_what_a_delay_does():
@@ -38,3 +44,17 @@ def test_what_another_effect_explains_better_beside_lines_is_no_way_of_the_comma
 
 def test_without_a_delay_there_are_no_steps():
     assert not prefers("zero", lines=9000, other=5000, late=20)
+
+
+def test_curves_that_explain_what_an_effect_does_need_none():
+    assert prefers("smooth", lines=9400, other=9010, late=0.0, best=400, best_after=10)
+
+
+def test_curves_are_seen_beside_an_effect_that_hides_them():
+    assert prefers("smooth", lines=177000, other=177092, late=8.0, best=166765, best_after=167132)
+
+
+def test_a_command_that_mostly_stays_where_it_is_goes_in_steps():
+    jumps, ramp = np.repeat([0.0, 5.0, 2.0], 4), np.linspace(0.0, 5.0, 12)
+    assert _hold_of_plateaus(SimpleNamespace(voltage_V=jumps)) == "zero"
+    assert _hold_of_plateaus(SimpleNamespace(voltage_V=ramp)) == "first"

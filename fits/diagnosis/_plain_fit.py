@@ -137,8 +137,7 @@ class PlainFit:
             return gained(holds) + self.largest_z(self.left_under(holds)) ** 2
 
         if found != taken and gained(found) > least:
-            share = 1 - off if "zero" in found else 1.0
-            return found if beside(found) > share * best else taken
+            return found if beside(found) > (1 - off) * best else taken
         # A large effect may hide between the samples what only shows beside it.
         curves = [
             tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in _some(len(taken))
