@@ -48,6 +48,8 @@ def test_without_a_delay_there_are_no_steps():
 
 def test_curves_that_explain_what_an_effect_does_need_none():
     assert prefers("smooth", lines=9400, other=9010, late=0.0, best=400, best_after=10)
+    assert prefers("smooth", lines=13801, other=13541, late=293, best=541, best_after=281)
+    assert not prefers("smooth", lines=13801, other=13741, late=0.0, best=541, best_after=481)
 
 
 def test_curves_are_seen_beside_an_effect_that_hides_them():

@@ -114,7 +114,7 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     part = replace(misfit, explained=fewer.cost - found.model.cost).share
     if card_of(name).independent or part >= thresholds.minor_share:
         return None
-    share = f"{100 * part:.0f} % of what the other causes leave"
+    share = f"{max(100 * part, 0.0):.0f} % of what the other causes leave"
     return part, name, f"it would explain {share}, and what makes the rest may look like that"
 
 

@@ -136,14 +136,16 @@ class PlainFit:
         def beside(holds: Holds) -> float:
             return gained(holds) + self.largest_z(self.left_under(holds)) ** 2
 
-        if found != taken and gained(found) > least:
-            return found if beside(found) > (1 - off) * best else taken
+        if "zero" in found and found != taken:
+            return found if gained(found) > least and beside(found) > (1 - off) * best else taken
         # A large effect may hide between the samples what only shows beside it.
-        curves = [
-            tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in _some(len(taken))
-        ]
-        found = max(curves, key=beside)
-        return found if beside(found) > best + least else taken
+        each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
+        curves = [tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in each]
+        found = max({found, *curves} - {taken}, key=beside)
+        shown = beside(found) > best + least
+        # They need no parameter, and are taken beside an effect that would explain little more.
+        large = gained(found) > max(least, thresholds.minor_share * best)
+        return found if shown or (large and beside(found) > (1 - off) * best) else taken
 
     def may_step(self, thresholds: Thresholds) -> bool:
         """Whether more than noise is left, and part of that is late, so that all commands may go in steps.
@@ -177,11 +179,6 @@ class PlainFit:
         rest = float(left @ left) - other.largest_z() ** 2
         # Of noise alone nothing would leave less.
         return rest > (1 + _NOISE) * len(left) and self.left_beside_lag() < rest
-
-
-def _some(count: int) -> list[set[int]]:
-    """Each run alone, and all of them."""
-    return [{k} for k in range(count)] + [set(range(count))]
 
 
 def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLDS) -> Holds:
