@@ -141,7 +141,7 @@ class PlainFit:
         # A large effect may hide between the samples what only shows beside it.
         each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
         curves = [tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in each]
-        found = max({found, *curves} - {taken}, key=beside)
+        found = max((holds for holds in (found, *curves) if holds != taken), key=beside)
         shown = beside(found) > best + least
         # They need no parameter, and are taken beside an effect that would explain little more.
         large = gained(found) > max(least, thresholds.minor_share * best)
