@@ -26,7 +26,7 @@ from microid.effects import card_of
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
 # Part of the budget after which the stage is not fitted in yet another way before effects are asked for.
-_PREPARED = 0.4
+_PREPARED = 0.5
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
 _ALL = (
