@@ -16,7 +16,7 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
-from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
+from fits.stage._checks import BESIDE_A_LAG, OR_ALONE, speed_Hz
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
@@ -131,8 +131,8 @@ def fit_baseline(
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
     `holds` say how the commands of `records` run between samples, as in `Stage`, in lines by default. Those of
-    `aside` run as these do, unless that part of their error goes otherwise. The fit goes `onward` from one that was
-    made.
+    `aside` run as the fastest of these, unless that part of their error goes otherwise. The fit goes `onward` from
+    one that was made.
 
     Raises
     ------
@@ -145,7 +145,8 @@ def fit_baseline(
     remarks: tuple[str, ...] = ()
     lines: list[Hold] = ["first"] * len(records)
     holds = holds or lines
-    hold = holds[0] if len({*holds}) == 1 else "first"
+    # What is fastest shows best how commands go on.
+    hold = holds[int(np.argmax([speed_Hz(record) for record in records]))]
     past = has_known_loop(records, range_V, holdout)
     try:
         near = None if onward is None else onward.held(hold)

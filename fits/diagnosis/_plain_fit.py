@@ -136,8 +136,14 @@ class PlainFit:
         def beside(holds: Holds) -> float:
             return gained(holds) + self.largest_z(self.left_under(holds)) ** 2
 
+        def shared(holds: Holds) -> Holds:
+            """The same with runs that do not show their own way going as the others do."""
+            (way,) = other if len(other := {*holds} - {*taken}) == 1 else {holds[0]}
+            alike = (way,) * len(holds)
+            return alike if gained(alike) > gained(holds) - least else holds
+
         if "zero" in found and found != taken:
-            return found if gained(found) > least and beside(found) > (1 - off) * best else taken
+            return shared(found) if gained(found) > least and beside(found) > (1 - off) * best else taken
         # A large effect may hide between the samples what only shows beside it.
         each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
         curves = [tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in each]
@@ -145,7 +151,7 @@ class PlainFit:
         shown = beside(found) > best + least
         # They need no parameter, and are taken beside an effect that would explain little more.
         large = gained(found) > max(least, thresholds.minor_share * best)
-        return found if shown or (large and beside(found) > (1 - off) * best) else taken
+        return shared(found) if shown or (large and beside(found) > (1 - off) * best) else taken
 
     def may_step(self, thresholds: Thresholds) -> bool:
         """Whether more than noise is left, and part of that is late, so that all commands may go in steps.
