@@ -147,11 +147,14 @@ class PlainFit:
         # A large effect may hide between the samples what only shows beside it.
         each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
         curves = [tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in each]
-        found = max((holds for holds in (found, *curves) if holds != taken), key=beside)
-        shown = beside(found) > best + least
+        others = [holds for holds in (found, *curves) if holds != taken]
+        found = max(others, key=beside)
+        if beside(found) > best + least:
+            return shared(found)
         # They need no parameter, and are taken beside an effect that would explain little more.
+        found = max(others, key=gained)
         large = gained(found) > max(least, thresholds.minor_share * best)
-        return shared(found) if shown or (large and beside(found) > (1 - off) * best) else taken
+        return shared(found) if large and beside(found) > (1 - off) * best else taken
 
     def may_step(self, thresholds: Thresholds) -> bool:
         """Whether more than noise is left, and part of that is late, so that all commands may go in steps.
