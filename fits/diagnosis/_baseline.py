@@ -16,7 +16,7 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
-from fits.stage._checks import BESIDE_A_LAG, OR_ALONE, speed_Hz
+from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
@@ -146,7 +146,8 @@ def fit_baseline(
     lines: list[Hold] = ["first"] * len(records)
     holds = holds or lines
     # What is fastest shows best how commands go on.
-    hold = holds[int(np.argmax([speed_Hz(record) for record in records]))]
+    rates = [np.diff(record.voltage_V) / np.diff(record.time_s) for record in records]
+    hold = holds[int(np.argmax([np.mean(rate**2) for rate in rates]))]
     past = has_known_loop(records, range_V, holdout)
     try:
         near = None if onward is None else onward.held(hold)
