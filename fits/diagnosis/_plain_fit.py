@@ -138,8 +138,7 @@ class PlainFit:
 
         def shared(holds: Holds) -> Holds:
             """The same with runs that do not show their own way going as the others do."""
-            (way,) = other if len(other := {*holds} - {*taken}) == 1 else {holds[0]}
-            alike = (way,) * len(holds)
+            alike = max(((way,) * len(holds) for way in dict.fromkeys(holds)), key=gained)
             return alike if gained(alike) > gained(holds) - least else holds
 
         if "zero" in found and found != taken:

@@ -29,8 +29,8 @@ _SKEWED = (
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
 _STEPS = (
-    "the command{} is taken to be held between samples, as a converter does, since the readings are late by half a "
-    "sample; a delay of that length would look the same"
+    "the command{} is taken to be held between samples, as a converter does: behind lines the readings would be late "
+    "by half a sample, and a delay of that length would look the same"
 )
 _CURVES = (
     "the command{} is taken to run along curves through its samples, since that leaves less of the displacement than "

@@ -192,15 +192,12 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         lagged = None if fast == slow else _without_mechanics(plan, solved, asked, levels, finest, runs)
         if lagged is not None and not any(one.far for one in misfits(runs, lagged.residuals_um)):
             return lagged.onward
-        try:
-            if (beside := _beside_lag(plan, problem, runs, responses)) is None:
-                raise
-            refuse_unidentifiable(beside, drives, fast=fast != slow)
-        except DataError:
-            if lagged is None:
-                raise
+        beside = _beside_lag(plan, problem, runs, responses)
+        if lagged is not None and (beside is None or not _identifiable(beside, drives, fast != slow)):
             return lagged.onward
-        assert beside is not None
+        if beside is None:
+            raise
+        refuse_unidentifiable(beside, drives, fast=fast != slow)
         poles = problem.chain.coordinates.of(beside.stage.without(beside.stage.names[-1]))
         return replace(problem, z=np.asarray(poles), columns_um=beside.columns_um)
     if dropped is not None:
@@ -209,6 +206,14 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         remarks = (_no_resonance(plan, dropped), *simpler.remarks)
         return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
+
+
+def _identifiable(solved: Solved, drives: Sequence[np.ndarray], fast: bool) -> bool:
+    try:
+        refuse_unidentifiable(solved, drives, fast)
+    except DataError:
+        return False
+    return True
 
 
 def _without_mechanics(
