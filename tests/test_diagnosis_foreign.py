@@ -72,6 +72,31 @@ def test_a_smooth_command_is_no_effect(rng):
 
 
 @pytest.mark.study
+def test_a_stack_in_steps_beside_lines_has_no_effect(rng):
+    """A driver and plays, no mass: the fast run is held by its converter, and the slow one runs in lines."""
+    held = np.repeat(rng.uniform(0, 100, 300), 8)
+    command, lag_s = np.r_[np.zeros(FINE), np.repeat(held, FINE)], rng.uniform(5e-4, 2e-3)
+    fine = np.arange(len(command)) / (RATE_Hz * FINE)
+    # What a first-order lag makes of steps, exactly: each step of the command begins at a sample.
+    share, driven = -np.expm1(-fine[1] / lag_s), np.zeros(len(command))
+    for k in range(1, len(command)):
+        driven[k] = driven[k - 1] + share * (command[k - 1] - driven[k - 1])
+    reading = plays(np.r_[0.0, 100.0, driven])[2:][::FINE]
+    count = len(reading)
+    slow = np.arange(2499 * FINE + 1) / (100 * FINE)
+    _, behind, _ = lsim(([1.0], [lag_s, 1.0]), np.interp(slow, np.arange(2500) / 100, SLOW_V), slow)
+    quiet = plays(behind)[::FINE] + 0.01 * rng.standard_normal(2500)
+    records = [Record(np.arange(2500) / 100, SLOW_V, quiet, source="slow.csv")]
+    noisy = reading + 0.01 * rng.standard_normal(count)
+    records.append(Record(fine[::FINE], command[::FINE], noisy, source="steps.csv"))
+    found = diagnose(records)
+    assert found.verdict == "no_effect"
+    assert found.baseline.hold == "zero"
+    assert found.baseline.names == ("driver", "hysteresis")
+    assert float(found.baseline["driver"].time_constant_s) == pytest.approx(lag_s, rel=0.05)
+
+
+@pytest.mark.study
 def test_creep_that_was_under_way(rng):
     """The record begins after moves whose creep goes on: the gain is found all the same."""
     before = turns([50, 100, 30, 0], 600)
