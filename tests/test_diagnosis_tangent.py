@@ -19,8 +19,8 @@ from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress, saturating
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
+from fits.stage._chain import Chain, offsets_out
 from fits.stage._fit import default_stage
-from fits.stage._moments import Chain, offsets_out
 from fits.stage._run import place_of_hysteresis
 from fits.stats._noise import Noise
 from microid.effects.backlash import Backlash

@@ -17,8 +17,8 @@ import microid as m
 from fits import Record, StageUncertainty, predict, save_model
 from fits.io._model_text import read_model_text
 from fits.loop._design import Grid
+from fits.stage._chain import offsets_out
 from fits.stage._declared import form_of, tools
-from fits.stage._moments import offsets_out
 from fits.stage._plain_stage import plain_model
 
 SAMPLES, INTERVAL_s, TINY, EXACT = 300, 1e-3, 1e-30, 1e-12

@@ -14,8 +14,8 @@ import microid as m
 from fits import Record, StageUncertainty, predict, save_model
 from fits.io._model_text import read_model_text
 from fits.loop._design import Grid
+from fits.stage._chain import offsets_out
 from fits.stage._declared import declared, form_of
-from fits.stage._moments import offsets_out
 from fits.stage._motion import predicted_ranges
 from fits.stage._plain_linear import _blockwise
 from fits.stage._plain_parts import SYSTEMS, PlainLinear
@@ -89,6 +89,24 @@ def test_linear_parts_are_those_of_the_matrix_exponential(damping_ratio, hold, e
         *driver_and_mechanics(time_constant_s, frequency_Hz, damping_ratio), time_s, seen, held, rest_V
     )
     np.testing.assert_allclose(found, expected[:, 1], rtol=0, atol=1e-10 * np.ptp(expected[:, 1]))
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_many_signals_are_followed_piece_by_piece(even, rng):
+    time_constant_s, frequency_Hz, damping_ratio = rng.uniform(1e-4, 1e-2), rng.uniform(30, 300), rng.uniform(0.01, 2)
+    time_s = np.cumsum(np.full(SAMPLES, 1e-3) if even else rng.uniform(0.5e-3, 2e-3, SAMPLES))
+    driver = PlainLinear("Driver", {"time_constant_s": time_constant_s, "gain": 1.0})
+    mechanics = PlainLinear(
+        "Mechanics", {"natural_frequency_Hz": frequency_Hz, "damping_ratio": damping_ratio, "gain": 1.0}
+    )
+    signal, each = rng.uniform(-40, 40, SAMPLES), rng.normal(size=50)
+    expected = states(
+        *driver_and_mechanics(time_constant_s, frequency_Hz, damping_ratio), time_s, signal, "first", signal[0]
+    )[:, 1:2]
+    system, cuts = driver.system().then(mechanics.system()), np.sort(rng.integers(1, SAMPLES, 4))
+    pieces = (piece for piece in np.split(signal[:, None] * each, cuts) if len(piece))
+    found = np.concatenate([*system.follow(np.diff(time_s)[: 1 if even else None], pieces)])
+    np.testing.assert_allclose(found, expected * each, rtol=0, atol=1e-10 * np.max(np.abs(expected * each)))
 
 
 @pytest.mark.parametrize("count", [1, 2, 17, 100])

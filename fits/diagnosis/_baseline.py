@@ -16,9 +16,9 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
+from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
-from fits.stage._moments import Chain
 from fits.stage._motion import prepare, signals
 from fits.stage._solve import Problem, prior_precision
 from fits.stats._noise import rough_noise_um

@@ -15,7 +15,9 @@ from fits.loop._design import Grid
 from fits.loop._past import rough_past_columns
 from fits.loop._prior import interpolation
 from fits.loop._run import Run
-from fits.stage._moments import Chain, linearise, pieces, propagated
+from fits.stage._chain import Chain
+from fits.stage._columns import combined, pieces, propagated
+from fits.stage._moments import linearise
 from fits.stage._run import ahead, place_of_hysteresis
 from microid import Coordinates, Stage
 from microid.effects import PLACES, AbstractEffect
@@ -103,7 +105,7 @@ def regress(
         residuals.append(run.displacement_um - plain)
         if roughness is not None:
             fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
-            moved = np.concatenate([columns @ roughness for _, columns in pieces(fine, z, run, True)])[:n]
+            moved = np.concatenate([*combined(fine, z, run, roughness)])
             structure.append(
                 np.split(propagated(fine.coordinates, fine.place, z, run, around, moved), [_FINE], axis=1)
             )

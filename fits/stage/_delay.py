@@ -11,7 +11,8 @@ from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, outlying
 from fits.loop._result import FitResult
 from fits.loop._run import Run
-from fits.stage._moments import along, linearise, pieces
+from fits.stage._columns import pieces
+from fits.stage._moments import along, linearise
 from fits.stage._run import hysteresis_of, nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, try_chain
 from fits.stage._start import best_shifts, measure_response, start_stages

@@ -17,8 +17,8 @@ from fits.io._model_text import SCHEMA, hash_of, pretty, read_model_text
 from fits.io._version import written_by
 from fits.loop._design import Grid
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
+from fits.stage._chain import offsets_out
 from fits.stage._encode import decode, encode
-from fits.stage._moments import offsets_out
 from fits.stage._uncertainty import StageUncertainty
 from microid import Preisach, Stage
 

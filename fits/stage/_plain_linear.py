@@ -3,6 +3,7 @@
 Numbers may be complex: along a tiny imaginary part all that is computed has its derivative (Squire and Trapp, 1998).
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -18,6 +19,8 @@ else:
 # As in `microid`: terms of the exponential series for a norm of a half, and doublings at most.
 _TERMS, _DOUBLINGS = 16, 64
 _EPS = float(np.finfo(float).eps)
+# Samples whose answers to each other are one product, where signals are at least so many.
+_BLOCK = 32
 
 
 @dataclass(frozen=True)
@@ -77,9 +80,68 @@ class Linear:
         if len(self.rest) == 0:
             return np.zeros_like(change), start
         step, taken = self._advance(interval_s, hold)
+        if change.shape[1] >= _BLOCK:
+            return self._products(step, taken, change, start)
         push = -taken[:, :, None] * change[:, None]
         states = _blockwise(step, push, start)
         return self.read @ states, states[-1] if len(states) else start
+
+    def follow(self, interval_s: np.ndarray, pieces: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+        """Respond to many signals piece by piece, `(l, k)` each, which rested before and run in lines; no offset.
+
+        Intervals are those between samples, `(t - 1,)`, or `(1,)` where all are alike.
+        """
+        if len(interval_s) > 1:
+            # The state before the first sample is one of rest, which no interval changes.
+            interval_s = np.append(interval_s[:1], interval_s)
+        last, states, first = None, np.zeros((len(self.rest), 1)), 0
+        for signals in pieces:
+            change = np.diff(signals, axis=0, prepend=signals[:1] if last is None else last)
+            each = interval_s if len(interval_s) == 1 else interval_s[first : first + len(signals)]
+            moved, states = self.move(each, change, states, "first")
+            moved += self.gain * signals
+            yield moved
+            last, first = signals[-1:].copy(), first + len(signals)
+
+    def _products(
+        self, step: np.ndarray, taken: np.ndarray, change: np.ndarray, start: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As `move`, by products of matrices: a block of samples answers all its changes, and states lead it on.
+
+        Going from sample to sample would wait for memory.
+        """
+        count, k = change.shape
+        out = np.empty(change.shape, dtype=np.result_type(step, taken, change, start))
+        whole = count - count % _BLOCK
+        # What is left is a shorter block.
+        blocks = ((0, whole, _BLOCK), (whole, count, count - whole))
+        for some, length in ((slice(first, stop), length) for first, stop, length in blocks if stop > first):
+            inside, here = change[some].reshape(-1, length, k), out[some].reshape(-1, length, k)
+            each = (step, taken) if len(step) == 1 else (step[some], taken[some])
+            answer, moved = self._of_blocks(*each, length)
+            np.matmul(answer[:, :, :length], inside, out=here)
+            for b in range(len(inside)):
+                one = min(b, len(answer) - 1)
+                here[b] += answer[one, :, length:] @ start
+                start = moved[one, :, :length] @ inside[b] + moved[one, :, length:] @ start
+        return out, start
+
+    def _of_blocks(self, step: np.ndarray, taken: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+        """What blocks of samples add to the output, and their last states, `(b, length, m)` and `(b, n, m)`.
+
+        Each is per unit of every change within the block, and then of every state before it, `m = length + n`.
+        """
+        n = len(self.rest)
+        step, taken = (one.reshape(-1, min(length, len(one)), *one.shape[1:]) for one in (step, taken))
+        state = np.zeros((len(step), n, length + n), dtype=np.result_type(step, taken))
+        state[:, :, length:] = np.eye(n)
+        answer = np.empty((len(step), length, length + n), dtype=np.result_type(state, self.read))
+        for j in range(length):
+            now = min(j, step.shape[1] - 1)
+            state = step[:, now] @ state
+            state[:, :, j] -= taken[:, now]
+            answer[:, j] = self.read @ state
+        return answer, state
 
     def _advance(self, interval_s: np.ndarray, hold: str) -> tuple[np.ndarray, np.ndarray]:
         """Matrices `exp(A h)`, and what the states lose by an input that rises by one, `(t, n, n)` and `(t, n)`."""

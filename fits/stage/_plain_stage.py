@@ -179,18 +179,7 @@ class PlainStage(PlainModel):
             yield from _beside(behind, each_s, around_um, responses)
             return
         system = around(behind)[1]
-        between_s = intervals(record.time_s)
-        if len(between_s) > 1:
-            # The state before the first sample is one of rest, which no interval changes.
-            between_s = np.append(between_s[:1], between_s)
-        states, last, first = np.zeros((len(system.rest), len(known.mean_um))), None, 0
-        for response in responses:
-            # At rest before the first sample.
-            change = np.diff(response, axis=0, prepend=response[:1] if last is None else last)
-            each = between_s if len(between_s) == 1 else between_s[first : first + len(response)]
-            moved, states = system.move(each, change, states, "first")
-            yield system.gain * response + moved
-            last, first = response[-1:], first + len(response)
+        yield from system.follow(intervals(record.time_s), responses)
 
 
 def _beside(
@@ -256,7 +245,7 @@ def _stage(content: Mapping[str, Any]) -> PlainStage | None:
 def _free(
     names: Sequence[str], parts: Sequence[PlainPart], frozen: Sequence[str]
 ) -> tuple[tuple[int, str, tuple[int, ...]], ...]:
-    """Parameters that a fit has moved, in the order of its coordinates; see `fits.stage._moments.offsets_out`."""
+    """Parameters that a fit has moved, in the order of its coordinates; see `fits.stage._chain.offsets_out`."""
     return tuple(
         (place, field, at)
         for place, (name, part) in enumerate(zip(names, parts, strict=True))

@@ -16,7 +16,7 @@ from fits.loop._design import Grid, columns_of
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, Samples
-from fits.stage._moments import offsets_out
+from fits.stage._chain import offsets_out
 from fits.stage._run import free_grid, nuisance_columns, prepare_again, project_out, residual_of, respond
 from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
 from microid import Coordinates, Stage, parameter_table

@@ -15,7 +15,8 @@ from fits.loop._moments import Data, Moments
 from fits.loop._prior import Hyper, definite, roughness
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run
-from fits.stage._moments import Chain, RunSums, run_sums, split_moments
+from fits.stage._chain import Chain
+from fits.stage._moments import RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
 from fits.stats._noise import correlation_samples, huber_weight
 from microid import Hold, Stage

@@ -14,8 +14,8 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._misfit import misfits, without_impulses
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run, prepare_run, simulate_run
+from fits.stage._chain import offsets_out
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
-from fits.stage._moments import offsets_out
 from fits.stage._run import (
     free_grid,
     hysteresis_of,

@@ -17,7 +17,8 @@ from fits.loop._prior import Hyper, definite, interpolation, roughness
 from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
-from fits.stage._moments import Chain, along, linearise, offsets_out
+from fits.stage._chain import Chain, offsets_out
+from fits.stage._moments import along, linearise
 from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._metrics import TWO_SIDED_95, WHITE
