@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from _command import run
+from _plant_reference import driver_and_mechanics, states
 from _wrong_records import said
 from scipy import signal
 
@@ -88,3 +89,20 @@ def test_a_diagnosis_does_not_advise_itself(hidden_by_a_lag, monkeypatch):
     (remark,) = _baseline.fit_baseline(fits.read_runs(hidden_by_a_lag), [], 0.2, "negative", print)
     assert "taken as quasi-static: fast.csv: sampled at" in remark
     assert remark.endswith("sample at 5 times the resonance or more")
+
+
+def test_a_driver_faster_than_a_sample_is_seen_under_steps(rng):
+    truth = {"driver.time_constant_s": 9e-5, "mechanics.natural_frequency_Hz": 260.0, "mechanics.damping_ratio": 0.02}
+    interval_s, per_step = 2.5e-4, 120
+    ramp = np.concatenate(
+        [np.linspace(a, b, 400, endpoint=False) for a, b in [(0, 100), (100, 10), (10, 80), (80, 0)]]
+    )
+    voltage = np.concatenate([ramp, np.repeat(rng.uniform(0, 100, 12), per_step)])
+    time = interval_s * np.arange(len(voltage))
+    seen = states(*driver_and_mechanics(*truth.values()), time, voltage, "zero", 0.0)[:, 1]
+    record = fits.Record(time, voltage, 0.8 * seen + rng.normal(0, 0.015, len(time)), source="one.csv")
+    result = fits.fit_stage([record], stage=fits.default_stage("zero"), initial="negative", levels=8, holdout=0.0)
+    for name, value in truth.items():
+        # Sixteen steps per sample follow it to some thousandths.
+        assert abs(result[name].value - value) < 5 * result[name].sd + 5e-3 * value
+    assert result.in_sample.rms_um < 1.1 * 0.015

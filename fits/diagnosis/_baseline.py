@@ -19,7 +19,7 @@ from fits.loop._run import Run, prepare_run
 from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
-from fits.stage._motion import prepare, signals
+from fits.stage._motion import at_samples, prepare, signals
 from fits.stage._solve import Problem, prior_precision
 from fits.stats._noise import rough_noise_um
 from microid import Hold, Mechanics, Stage
@@ -105,8 +105,8 @@ class Baseline:
 
 def simulate(stage: Stage, run: Run) -> np.ndarray:
     """Response of a stage to a run that is refined already, in um, shape `(n,)`."""
-    values = signals(stage.with_substeps(1), prepare(stage, run))[-1].values
-    return np.asarray(values)[:: run.samples.stride][: len(run.record)]
+    prepared = prepare(stage, run)
+    return at_samples(signals(stage.with_substeps(1), prepared)[-1], prepared)
 
 
 def with_effects(stage: Stage, effects: Sequence[AbstractEffect]) -> Stage:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import takewhile
 
 import equinox as eqx
 import jax
@@ -15,8 +14,8 @@ from jaxtyping import Array, Float
 from fits.diagnosis._baseline import Baseline, with_effects
 from fits.diagnosis._records import LONG
 from fits.io._record import Record
-from fits.stage._motion import Prepared, prepare, program, signals
-from microid import Coordinates, Sensor, Signal
+from fits.stage._motion import Prepared, at_samples, prepare, program, signals
+from microid import Coordinates, Sensor
 from microid.effects import AbstractEffect
 
 # Number of programs, of some 7 MB each, from which on they make room for each other.
@@ -54,13 +53,7 @@ class Bench:
         """Simulate one run with effects; um, shape `(n,)`."""
         one = self.prepared[run]
         stage = with_effects(self.stage, self._seen(effects, one))
-        # Up to the first part that is another, the signal is known.
-        pairs = zip(stage.parts, self.stage.parts, strict=False)
-        same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], pairs))
-        signal = self.known[run][same]
-        for part in stage.parts[same:]:
-            signal = program()(part, one.run.samples.time_s, signal, one.scene)
-        return at_samples(signal, one)
+        return at_samples(signals(stage, one, self.stage, self.known[run])[-1], one)
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""
@@ -73,11 +66,6 @@ class Bench:
     def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """What effects that all runs share change in them, in um."""
         return [self.respond_in(run, effects) - plain for run, plain in enumerate(self.plain)]
-
-
-def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
-    """Values of a refined signal at the samples of its run, shape `(n,)`."""
-    return np.asarray(signal.values)[:: prepared.run.samples.stride][: len(prepared.run.record)]
 
 
 def drop_programs(records: Sequence[Record]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
-from fits.diagnosis._effects import Bench, at_samples
+from fits.diagnosis._effects import Bench
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
@@ -17,7 +17,7 @@ from fits.diagnosis._result import Gain
 from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._run import Run
-from fits.stage._motion import signals
+from fits.stage._motion import at_samples, signals
 from fits.stage._run import project_out
 from fits.stats._compare import is_worse, sd_of_difference
 from microid import Stage

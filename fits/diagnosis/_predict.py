@@ -8,7 +8,7 @@ from scipy.linalg import qr
 
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._regression import Kinds, Regression, regress, saturating
+from fits.diagnosis._regression import Regression, beside, regress
 from fits.io._record import Record
 from fits.loop._run import prepare_run
 from fits.stats._noise import Noise
@@ -104,8 +104,7 @@ class Predictor:
         if k == 0:
             return projector
         effects = [self.hypotheses[k].effects(run) for run in range(len(self.bench.prepared))]
-        regression = regress(self.bench.baseline, _same(projector.regression, effects), effects)
-        return Projector(regression, projector.noise, projector.roughness, projector.held)
+        return Projector(beside(projector.regression, effects), projector.noise, projector.roughness, projector.held)
 
     def _old_columns(self) -> list[list[np.ndarray]]:
         """Of all hypotheses, what they change in the runs at hand, and the derivatives of that."""
@@ -134,7 +133,7 @@ class Predictor:
         baseline = self.bench.baseline
         record = next_record(time_s, voltage_V, self.bench.prepared[self._like].run.record)
         # With steps between the samples that are too long, a lag and a delay differ by what both are off.
-        stride = baseline.finest[self._like].samples.stride
+        stride = baseline.fine[self._like].samples.stride
         run = prepare_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
         alone = baseline.alone(run)
         bench, noise = Bench(alone), self._noise(float(time_s[1] - time_s[0]))
@@ -151,7 +150,7 @@ class Predictor:
         grams, last = {}, None
         for k in self._old:
             effects = [self._next[k].effects(0)]
-            last = regress(alone, None if last is None else _same(last, effects), effects)
+            last = regress(alone, None, effects) if last is None else beside(last, effects)
             shared = [last.rows[0], *self._finer_of(last)]
             rows = noise.whiten(np.concatenate([*shared, np.stack(columns, axis=1)], axis=1))[run.fitted]
             nuisance, _ = qr(noise.whiten(last.nuisance[0])[run.fitted], mode="economic")
@@ -193,11 +192,6 @@ def next_record(time_s: np.ndarray, voltage_V: np.ndarray, like: Record) -> Reco
     share, old = np.linspace(0, 1, len(time_s)), np.linspace(0, 1, len(like))
     extra = {name: np.interp(share, old, values) for name, values in like.extra.items()}
     return Record(time_s, voltage_V, np.zeros(len(time_s)), extra, source="the next run")
-
-
-def _same(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -> Kinds | None:
-    """What is finer than the grid, if it is the same beside other effects."""
-    return None if any(regression.saturating) or any(map(saturating, effects)) else regression.finer
 
 
 def _changes(bench: Bench, h: Hypothesis) -> tuple[list[np.ndarray], list[list[list[np.ndarray]]]]:

@@ -1,7 +1,7 @@
 """All runs as one regression: Jacobian of the baseline, and structure of the density finer than its grid."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -18,6 +18,7 @@ from fits.loop._run import Run
 from fits.stage._chain import Chain
 from fits.stage._columns import combined, pieces, propagated
 from fits.stage._moments import linearise
+from fits.stage._motion import at_samples, prepare, signals
 from fits.stage._run import ahead, place_of_hysteresis
 from microid import Coordinates, Stage
 from microid.effects import PLACES, AbstractEffect
@@ -87,10 +88,9 @@ def regress(
         _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
-        # The change of others depends on driver and mechanics: a lag of the sensor and one of the driver do nearly
-        # the same, so that telling them apart takes exact derivatives.
-        dependent = tuple(one for one in own if one.place not in ("environment", "noise"))
-        both[:, chain.size :] = slope[:n] + (_slope_of_change(baseline, dependent, few) if dependent else 0.0)
+        # A lag of the sensor and one of the driver do nearly the same, so that telling them apart takes derivatives
+        # that go through effects.
+        both[:, chain.size :] = slope[:n] + _slope_of_change(baseline, own, few)
         for first, columns in pieces(here, z, run, True):
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
@@ -130,18 +130,38 @@ def _without_decayed(nuisance: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     return np.where(left, nuisance, 0.0)
 
 
-def _slope_of_change(baseline: Baseline, effects: tuple[AbstractEffect, ...], run: Run) -> np.ndarray:
+def beside(regression: Regression, effects: Sequence[Sequence[AbstractEffect]]) -> Regression:
+    """The same regression beside other effects: from afresh where derivatives along the columns go through them."""
+    baseline, size = regression.baseline, regression.baseline.chain.size
+    if any(regression.saturating) or any(map(saturating, effects)):
+        return regress(baseline, None, effects)
+    rows = []
+    for run, before, last, now in zip(baseline.coarse, regression.rows, regression.effects, effects, strict=True):
+        moved = _slope_of_change(baseline, now, run) - _slope_of_change(baseline, last, run)
+        rows.append(np.concatenate([before[:, :size], before[:, size:] + moved], axis=1))
+    return replace(regression, rows=tuple(rows), effects=tuple(map(tuple, effects)))
+
+
+def _slope_of_change(baseline: Baseline, effects: Sequence[AbstractEffect], run: Run) -> np.ndarray:
     """Derivatives along the coordinates of what effects change, shape `(n, p)`, by central differences.
 
-    Their programs are at hand, those of exact ones would have to be compiled for every effect.
+    The change of those before or after the stage does not depend on it. The programs of the others are at hand, those
+    of exact derivatives would have to be compiled for every effect.
     """
+    # Without driver and mechanics there are no coordinates.
+    out = np.zeros((len(run.record), len(baseline.z)))
+    dependent = [one for one in effects if one.place not in ("environment", "noise")]
+    if not dependent or len(baseline.z) == 0:
+        return out
+    here, prepared = baseline.stage.with_substeps(1), prepare(baseline.stage, run)
+    known = signals(here, prepared)
 
     def change(step: np.ndarray) -> np.ndarray:
-        stage = baseline.moved(step, 0.0).stage
-        return simulate(with_effects(stage, effects), run) - simulate(stage, run)
+        plain = baseline.moved(step, 0.0).stage.with_substeps(1)
+        passed = signals(plain, prepared, here, known)
+        extended = signals(with_effects(plain, dependent), prepared, plain, passed)
+        return at_samples(extended[-1], prepared) - at_samples(passed[-1], prepared)
 
-    # Without driver and mechanics there are no coordinates.
-    out = np.empty((len(run.record), len(baseline.z)))
     for k, step in enumerate(_STEP * np.eye(len(baseline.z))):
         out[:, k] = (change(step) - change(-step)) / (2 * _STEP)
     return out

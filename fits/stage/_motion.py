@@ -1,10 +1,13 @@
 """What a command makes a stage do, between its samples as well: voltage at the piezo, displacement, derivatives."""
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import takewhile
 from typing import Any
 
+import jax
 import numpy as np
 
 from fits.io._kept import kept
@@ -40,14 +43,32 @@ def program() -> Callable[[AbstractPart, Any, Signal, Scene], Signal]:
     return kept(through)
 
 
-def signals(stage: Stage, prepared: Prepared) -> list[Signal]:
-    """What goes into each part of a stage, and at the end what comes out."""
-    signal = prepared.scene.command
-    found = [signal]
-    for part in stage.parts:
-        signal = program()(part, prepared.run.samples.time_s, signal, prepared.scene)
-        found.append(signal)
+def signals(
+    stage: Stage, prepared: Prepared, like: Stage | None = None, known: Sequence[Signal] = ()
+) -> list[Signal]:
+    """What goes into each part of a stage, and at the end what comes out.
+
+    Those `known` of a stage `like` it are kept up to the first part that is another.
+    """
+    pairs = () if like is None else zip(stage.parts, like.parts, strict=False)
+    same = sum(1 for _ in takewhile(lambda pair: _is_same(*pair), pairs))
+    found = [*known[: same + 1]] or [prepared.scene.command]
+    for part in stage.parts[same:]:
+        found.append(program()(part, prepared.run.samples.time_s, found[-1], prepared.scene))
     return found
+
+
+def at_samples(signal: Signal, prepared: Prepared) -> np.ndarray:
+    """Values of a refined signal at the samples of its run, shape `(n,)`."""
+    return np.asarray(signal.values)[:: prepared.run.samples.stride][: len(prepared.run.record)]
+
+
+def _is_same(part: AbstractPart, other: AbstractPart) -> bool:
+    """Whether two parts do the same."""
+    if part is other:
+        return True
+    (one, form), (two, other_form) = jax.tree.flatten(part), jax.tree.flatten(other)
+    return operator.eq(form, other_form) and all(map(np.array_equal, one, two))
 
 
 def motion(

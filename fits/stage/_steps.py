@@ -33,8 +33,8 @@ from microid.effects import EFFECTS
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
-# Steps per sample that a fit takes at most.
-_FINEST = 16
+# Steps per sample that a fit begins with under a command in steps, and takes at most.
+_IN_STEPS, _FINEST = 4, 16
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,11 @@ class Plan:
     def interval_s(self) -> float:
         """Shortest of the sampling intervals."""
         return min(float(np.median(np.diff(record.time_s))) for record in self.records)
+
+    @property
+    def coarsest(self) -> int:
+        """Steps per sample to begin with: one does not see how a driver answers to a command in steps."""
+        return _IN_STEPS if "zero" in self.holds else 1
 
     def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
         """One of them, its command that much later."""
@@ -127,10 +132,10 @@ def present_problem(plan: Plan, stage: Stage) -> tuple[Plan, Problem]:
         problem = Problem.of(stage, None, np.zeros(0), None, 1.0)
     except ValueError as error:
         raise DataError(f"{error}: thaw some of the stage") from error
-    runs = plan.runs(1)
+    runs = plan.runs(plan.coarsest)
     if yields_inside(stage):
         plan = replace(plan, settled=plan.settled_for(stage, runs))
-        return plan, _best_start(plan, [problem], plan.runs(1)).onward
+        return plan, _best_start(plan, [problem], plan.runs(plan.coarsest)).onward
     drives = hysteresis_alone(stage, runs)
     poles = start_stages(stage, [measure_response(*each) for each in zip(runs, drives, strict=True)])
     problems = [problem, *(replace(problem, z=np.asarray(problem.chain.coordinates.of(one))) for one in poles)]
@@ -160,7 +165,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]  # all others are fast
     fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
-    runs = plan.runs(1)
+    runs = plan.runs(plan.coarsest)
     if fitted is not None:
         name = fitted[0]
         refuse_slopes([plan.records[k] for k in slow])
@@ -290,13 +295,13 @@ def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
 
 def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
     """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
-    stride = 1
+    stride, refined = plan.coarsest, False
     while True:
         runs = plan.runs(stride)
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
         precision = Precision(solved)
         inside = yields_inside(solved.stage)
-        if not inside and (plan.gain is None or stride > 1):
+        if not inside and (plan.gain is None or refined):
             return solved, precision
         moved = np.zeros(len(solved.z))
         for own, run, halved in zip(precision.influence, runs, plan.runs(2 * stride), strict=True):
@@ -310,7 +315,7 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         if stride == _FINEST:
             said = f"{stride} steps per sample are few: more would move a parameter by {0.15 * excess:.2g} sd"
             return replace(solved, problem=replace(problem, remarks=(*problem.remarks, said))), precision
-        stride = min(_FINEST, stride * 2 ** math.ceil(math.log2(excess) / 2))
+        stride, refined = min(_FINEST, stride * 2 ** math.ceil(math.log2(excess) / 2)), True
         plan.progress(f"{stride} steps per sample")
         problem = replace(solved.onward, z=_restart_driver(plan, solved))
 
