@@ -108,7 +108,9 @@ def refuse_unidentifiable(
     lacking = mechanics and (some or beyond) and named_parts(stage, Driver)
     if may_drop and seen and lacking and all(map(_resolved, solved.runs)):
         return (beyond or mechanics)[0][0]
-    if unidentified and not fast and len(unidentified) < len(poles):
+    # A driver beside a mode that is shown may as well be too quick to be.
+    quick = modes and all(name.endswith(".time_constant_s") for name in unidentified)
+    if unidentified and not fast and len(unidentified) < len(poles) and not quick:
         raise DataError(
             f"{sources}: these runs are all about as slow, and do not show {', '.join(unidentified)}; {_BEYOND}"
         )

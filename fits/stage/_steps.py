@@ -33,6 +33,8 @@ from microid.effects import EFFECTS
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
+# How many times what a start leaves, on average, is too much beside one that has a lag of the reading, too.
+_BAD = 3.0
 # Steps per sample that a fit begins with under a command in steps, and takes at most.
 _IN_STEPS, _FINEST = 4, 16
 
@@ -203,14 +205,25 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         if beside is None:
             raise
         refuse_unidentifiable(beside, drives, fast=fast != slow)
-        poles = problem.chain.coordinates.of(beside.stage.without(beside.stage.names[-1]))
-        return replace(problem, z=np.asarray(poles), columns_um=beside.columns_um)
+        return _without_lag(problem, beside)
+    if plan.accept_best and any(one.far for one in misfits(runs, solved.residuals_um)):
+        # What a fit in a bad minimum leaves looks like many things; beside a lag it may find the poles.
+        beside = _beside_lag(plan, problem, runs, responses)
+        least = math.log(_BAD) * sum(int(run.fitted.sum()) for run in runs)
+        if beside and solved.cost - beside.cost > least and _identifiable(beside, drives, fast != slow):
+            return _without_lag(problem, beside)
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
         remarks = (_no_resonance(plan, dropped), *simpler.remarks)
         return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
+
+
+def _without_lag(problem: Problem, beside: Solved) -> Problem:
+    """Go on from a fit that had a lag of the reading at the end, without that."""
+    poles = problem.chain.coordinates.of(beside.stage.without(beside.stage.names[-1]))
+    return replace(problem, z=np.asarray(poles), columns_um=beside.columns_um)
 
 
 def _identifiable(solved: Solved, drives: Sequence[np.ndarray], fast: bool) -> bool:
