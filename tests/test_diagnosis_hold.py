@@ -12,7 +12,7 @@ from fits.diagnosis._thresholds import THRESHOLDS
 
 def prefers(hold, lines, other, late, late_after=0.0, best=None, best_after=0.0):
     """Of costs under lines and under the other, what a delay takes off either, and what the best effect does."""
-    left, after, bad = (np.array([cost**0.5]) for cost in (lines, other, 1e6))
+    left, after, bad = (np.full(10_000, cost**0.5 / 100) for cost in (lines, other, 1e6))
 
     def largest_z(at=left):
         return (max(best_after, late_after) if at is after else max(best or 0.0, late) * (at is left)) ** 0.5
@@ -54,6 +54,10 @@ def test_curves_that_explain_what_an_effect_does_need_none():
 
 def test_curves_are_seen_beside_an_effect_that_hides_them():
     assert prefers("smooth", lines=177000, other=177092, late=8.0, best=166765, best_after=167132)
+
+
+def test_curves_that_leave_a_little_less_of_much_are_no_way_of_the_command():
+    assert not prefers("smooth", lines=74000, other=75700, late=0.0, best=50700, best_after=52650)
 
 
 def test_a_command_that_mostly_stays_where_it_is_goes_in_steps():

@@ -8,12 +8,12 @@ import numpy as np
 
 from fits.diagnosis._baseline import simulate
 from fits.diagnosis._effects import Bench, Law
-from fits.diagnosis._joint_fit import fit_from_poles
+from fits.diagnosis._joint_fit import alternate, fit_from_poles
 from fits.diagnosis._noise import Faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import Regression
-from fits.diagnosis._score import Probe, applicable, probes_of, scales_of, score
+from fits.diagnosis._score import Probe, applicable, law_of, probes_of, scales_of, score
 from fits.diagnosis._thresholds import Thresholds
 from microid import Hold
 from microid.effects import EFFECTS, Scales
@@ -148,7 +148,8 @@ class PlainFit:
         curves = [tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in each]
         others = [holds for holds in (found, *curves) if holds != taken]
         found = max(others, key=beside)
-        if beside(found) > best + least:
+        # Of what more than noise is left in any way, a small part decides nothing.
+        if beside(found) > best + max(least, off * (whole - best - len(self.left))):
             return shared(found)
         # They need no parameter, and are taken beside an effect that would explain little more.
         found = max(others, key=gained)
@@ -180,13 +181,29 @@ class PlainFit:
         ends = fit_from_poles(self.bench, self.projector, model)
         return min((end[-1].cost for end in ends), default=np.inf)
 
+    def left_beside_delay(self) -> float:
+        """Sum of squares beside a delay of the reading."""
+        scores = score(self.projector, self._delays, self.left).each
+        if not scores:
+            return np.inf
+        law = law_of(max(scores, key=lambda one: one.drop), len(self.regression.baseline.runs))
+        model = refit(self.bench, self.projector, [law], [law.start])
+        return alternate(self.bench, self.projector, model)[-1].cost
+
     def outdoes(self, other: "PlainFit") -> bool:
-        """Whether a lag of the reading leaves less here than another fit does with the best effect beside it."""
+        """Whether a lag of the reading leaves less here than another fit does with the best effect beside it.
+
+        Curves leave less by far, or lines are kept. Steps are much like lines behind a delay: that is not asked then.
+        """
         there = Projector(other.regression, self.faults.noise).bounded()
         left = there.off(there.residual)
         rest = float(left @ left) - other.largest_z() ** 2
         # Of noise alone nothing would leave less.
-        return rest > (1 + _NOISE) * len(left) and self.left_beside_lag() < rest
+        if rest <= (1 + _NOISE) * len(left):
+            return False
+        if "zero" in other.holds:
+            return self.left_beside_lag() < rest
+        return min(self.left_beside_lag(), self.left_beside_delay()) < (1 + _NOISE) * rest
 
 
 def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLDS) -> Holds:
