@@ -193,17 +193,20 @@ class PlainFit:
     def outdoes(self, other: "PlainFit") -> bool:
         """Whether a lag of the reading leaves less here than another fit does with the best effect beside it.
 
-        Curves leave less by far, or lines are kept. Steps are much like lines behind a delay: that is not asked then.
+        Curves need no effect, or leave less by far beside one, or lines are kept. Steps are much like lines behind a
+        delay: that is not asked then.
         """
         there = Projector(other.regression, self.faults.noise).bounded()
         left = there.off(there.residual)
-        rest = float(left @ left) - other.largest_z() ** 2
+        whole = float(left @ left)
+        rest = whole - other.largest_z() ** 2
         # Of noise alone nothing would leave less.
         if rest <= (1 + _NOISE) * len(left):
             return False
         if "zero" in other.holds:
             return self.left_beside_lag() < rest
-        return min(self.left_beside_lag(), self.left_beside_delay()) < (1 + _NOISE) * rest
+        beside = min(self.left_beside_lag(), self.left_beside_delay())
+        return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)
 
 
 def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLDS) -> Holds:

@@ -305,8 +305,9 @@ def _refined(best: Explanation, start: Explanation, search: Search) -> Selection
     causes, model = _backward(best.bench, best.projector, list(best.causes), best.model, tie)
     explained = plain.cost - model.cost
     bench, projector, model, finest = refine(best.bench, best.projector, model, search.has_time)
-    # One may have become unnecessary since.
-    causes, model = _backward(bench, projector, causes, model, tie)
+    if search.has_time():
+        # One may have become unnecessary since.
+        causes, model = _backward(bench, projector, causes, model, tie)
     # In the end the density is smoother and nowhere negative, which costs something by itself.
     explained = max(explained, plain.cost - model.cost, 0.0)
     scored, at = (start.left, best.left, best.family), (bench, projector, start.projector)
