@@ -57,8 +57,12 @@ class Certainty:
         tangent = density.off(density.join([one[:, size:] for one in self.rows]))
         return np.sqrt(np.diagonal(replace(self.model, tangent=tangent).covariance()))
 
-    def predictions(self, stage: Stage, residuals_um: Sequence[np.ndarray]) -> StageUncertainty | None:
+    def predictions(
+        self, stage: Stage, residuals_um: Sequence[np.ndarray], own: bool = True
+    ) -> StageUncertainty | None:
         """Perturbations of a stage that the model's effects were put into, for the band of its predictions.
+
+        Those that each run has of its `own` may have been left out.
 
         What neighbouring samples share of its residuals in the runs is the model's own error. There are none where an
         effect is around the hysteresis, through which columns do not pass in proportion, or without any coordinate.
@@ -73,8 +77,8 @@ class Certainty:
         ):
             return None
         size, others = baseline.chain.size, self.rows[0].shape[1] - baseline.chain.size
-        own = scale_free(baseline.prior, baseline.columns_um)
-        basis, prior = fewer_columns(grid.levels, own, baseline.hyper, baseline.stroke_um)
+        known = scale_free(baseline.prior, baseline.columns_um)
+        basis, prior = fewer_columns(grid.levels, known, baseline.hyper, baseline.stroke_um)
         few = basis.shape[1]
         whole = np.zeros((size + others, few + others))
         whole[:size, :few], whole[size:, few:] = basis, np.eye(others)
@@ -90,14 +94,14 @@ class Certainty:
         mean = self.rows[0][baseline.runs[0].fitted].mean(axis=0)
         left = [one[run.fitted] for one, run in zip(residuals_um, baseline.runs, strict=False)]
         return StageUncertainty(
-            jnp.asarray(moves @ self._into(stage).T),
+            jnp.asarray(moves @ self._into(stage, own).T),
             jnp.asarray(columns_um),
             jnp.asarray(np.concatenate([columns_um, moves], axis=1) @ mean),
             jnp.asarray(max(0.0, float(np.mean([shared_square(one) for one in left]))) ** 0.5),
             grid,
         )
 
-    def _into(self, stage: Stage) -> np.ndarray:
+    def _into(self, stage: Stage, own: bool) -> np.ndarray:
         """Derivatives of an extended stage's coordinates along those of plain stage and effects, shape `(p, k)`."""
         baseline, model = self.baseline, self.model
         stops = np.cumsum([len(baseline.z), *(law.size for law in model.laws)])
@@ -107,7 +111,7 @@ class Certainty:
         def coordinates(moved: np.ndarray) -> np.ndarray:
             dz, *dx = np.split(moved, stops[:-1])
             there = replace(model, x=tuple(x + d for x, d in zip(model.x, dx, strict=True)))
-            moved_stage = with_effects(baseline.moved(dz, 0.0).stage, shared_effects(there, runs))
+            moved_stage = with_effects(baseline.moved(dz, 0.0).stage, shared_effects(there, runs, own=own))
             return np.asarray(chain.coordinates.of(moved_stage.with_substeps(stage.substeps)))
 
         out = [(coordinates(step) - coordinates(-step)) / (2 * _STEP) for step in _STEP * np.eye(int(stops[-1]))]

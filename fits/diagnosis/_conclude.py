@@ -14,6 +14,7 @@ from fits.diagnosis._extension import (
     extend_stage,
     feedforward,
     gain_of,
+    is_own,
     plain_stage,
     predicts_worse,
     without_effects,
@@ -81,7 +82,7 @@ def conclude(
     # What is small beside the noise may be an error of the plain stage that is too small to show.
     small = misfit.explained < thresholds.rest_noise**2 * misfit.count
     # Of what one run had of its own other runs show nothing.
-    repeats = not any(one.per_run or hasattr(one, "after_s") for one in extension.effects)
+    repeats = not any(map(is_own, extension.effects))
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
     # Both need the support of what was held out.
     most_z = -thresholds.worse_z / 2 if weak or small else thresholds.worse_z
@@ -96,9 +97,12 @@ def conclude(
         extension = extend_stage(ready, found, None)
     remarks += minor
     if kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
-        own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if one.per_run}))
-        remarks.append(f"{own}: not the same in the runs held out, so that the stage is left plain")
-        extension = without_effects(ready, extension)
+        own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if is_own(one)}))
+        others = extend_stage(ready, found, model, own=False)
+        plain = not others.effects or predicts_worse(others.compared[len(baseline.runs) :], 0.0, 0.0)
+        extension = without_effects(ready, extension) if plain else others
+        how = "the stage is left plain" if plain else "the extended stage is without"
+        remarks.append(f"{own}: not the same in the runs held out, so that {how}")
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * noise_um < rounding_um)
     cyclic = (
@@ -171,7 +175,8 @@ def conclude(
     if extension.effects:
         sure = Certainty(found.projector, model, found.bench, extension.baseline)
         after = sure.parameters(causes)
-        extended_band = sure.predictions(extension.stage, [one.after_um for one in extension.compared])
+        left_um = [one.after_um for one in extension.compared]
+        extended_band = sure.predictions(extension.stage, left_um, extension.own)
     likely = {cause.name for cause in causes} | {rival.name for cause in kept for rival in cause.rivals}
     return Diagnosis(
         verdict="unexplained" if unexplained else "effect_found" if causes else "no_effect",

@@ -38,12 +38,16 @@ class Compared:
 
 @dataclass(frozen=True)
 class Extension:
-    """A stage with effects, a baseline with them, and residuals in all runs, those held out whole last."""
+    """A stage with effects, a baseline with them, and residuals in all runs, those held out whole last.
+
+    Effects that each run has of its `own` may be left out.
+    """
 
     stage: Stage
     baseline: Baseline
     compared: tuple[Compared, ...]
     effects: tuple[AbstractEffect, ...]
+    own: bool = True
 
 
 def plain_stage(ready: Prepared) -> Stage:
@@ -51,8 +55,11 @@ def plain_stage(ready: Prepared) -> Stage:
     return ready.baseline.stage.with_substeps(max(run.samples.stride for run in ready.baseline.fine))
 
 
-def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Extension:
-    """Let the plain stage follow what the effects of a model leave, and compare the two; none for the plain stage."""
+def extend_stage(ready: Prepared, found: Selection, model: Refit | None, own: bool = True) -> Extension:
+    """Let the plain stage follow what the effects of a model leave, and compare the two; none for the plain stage.
+
+    Those that each run has of its `own` may be left out of the stage.
+    """
     baseline = ready.baseline
     if model is None or not model.laws:
         compared = _compare(ready, ready.bench, None, ready.regression, (), False)
@@ -60,11 +67,16 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None) -> Exte
     # What followed along the tangent is put into the stage itself.
     beside = found.projector
     regression = regress(beside.move(beside.residual - beside.join(model.change_um)), ())
-    effects = shared_effects(model, len(baseline.runs), ready.reading.thresholds.minor_share)
+    effects = shared_effects(model, len(baseline.runs), ready.reading.thresholds.minor_share, own)
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
     stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)
     compared = _compare(ready, Bench(regression.baseline), model, regression, effects, found.finest)
-    return Extension(stage, regression.baseline, compared, tuple(effects))
+    return Extension(stage, regression.baseline, compared, tuple(effects), own)
+
+
+def is_own(effect: AbstractEffect) -> bool:
+    """Whether other runs may have none of an effect, or another, as a hum or what happened at one instant."""
+    return effect.per_run or hasattr(effect, "after_s")
 
 
 def without_effects(ready: Prepared, extension: Extension) -> Extension:
@@ -74,10 +86,12 @@ def without_effects(ready: Prepared, extension: Extension) -> Extension:
     return Extension(plain_stage(ready), ready.baseline, (*extension.compared[:runs], *behind), ())
 
 
-def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_share) -> list[AbstractEffect]:
+def shared_effects(
+    model: Refit, runs: int, spread: float = THRESHOLDS.minor_share, own: bool = True
+) -> list[AbstractEffect]:
     """The effects as a model holds them: strengths that every run has by their mean, and others not at all.
 
-    Every run has one whose relative `spread` is no larger.
+    Every run has one whose relative `spread` is no larger. Effects that each has of its `own` may be left out.
     """
     found = []
     for law, x in zip(model.laws, model.x, strict=True):
@@ -91,7 +105,7 @@ def shared_effects(model: Refit, runs: int, spread: float = THRESHOLDS.minor_sha
             found.append(replace(each[0], **{name: _common(each, name, spread) for name in law.form.strength}))
         else:
             found.append(each[0])
-    return found
+    return [one for one in found if own or not is_own(one)]
 
 
 def _common(each: Sequence[AbstractEffect], name: str, spread: float) -> Float[Array, "..."]:
