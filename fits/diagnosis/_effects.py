@@ -18,8 +18,8 @@ from fits.stage._motion import Prepared, at_samples, prepare, program, signals
 from microid import Coordinates, Sensor
 from microid.effects import AbstractEffect
 
-# Number of programs, of some 7 MB each, from which on they make room for each other.
-_MANY = 400
+# Number of programs, of some 5 MB each, from which on they make room for each other.
+_MANY = 200
 # Part of a period of the resonance between samples, beyond which a run does not resolve it.
 _PERIOD = 0.25
 # Periods of a line in a record, as its samples show it, below which it is a drift as well.
@@ -56,11 +56,12 @@ class Bench:
         return at_samples(signals(stage, one, self.stage, self.known[run])[-1], one)
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
-        """Those that a run may be asked about: none that is its own and too fast for its samples."""
+        """Those that a run may be asked about: none that is its own and too fast for its samples, or its past."""
         record = prepared.run.record
         interval_s = float(np.median(np.diff(record.time_s)))
         slow = not self.resonance_Hz * interval_s > _PERIOD
         asked = [effect for effect in effects if slow or not (effect.fast and effect.per_run)]
+        asked = [effect for effect in asked if not (effect.past and prepared.run.has_past)]
         return [without_drifts(effect, interval_s, record.duration_s) for effect in asked]
 
     def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:

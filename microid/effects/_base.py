@@ -96,6 +96,8 @@ class AbstractEffect(AbstractPart):
         Whether it is only seen in records that show the dynamics.
     per_run
         Whether it differs from record to record, as a drift does.
+    past
+        Whether it is what the hysteresis remembers from before a record, which may be estimated without it.
     finite
         Whether it must be tried at its full size, because at zero it has no derivative, or none that says much.
     repeats
@@ -150,6 +152,7 @@ class AbstractEffect(AbstractPart):
     moved: ClassVar[str] = ""
     fast: ClassVar[bool] = False
     per_run: ClassVar[bool] = False
+    past: ClassVar[bool] = False
     finite: ClassVar[bool] = False
     repeats: ClassVar[bool] = False
     counted: ClassVar[tuple[str, ...]] = ()

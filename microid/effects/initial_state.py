@@ -32,6 +32,7 @@ class InitialState(AbstractEffect):
     strength: ClassVar[tuple[str, ...]] = ("excess_V",)
     finite: ClassVar[bool] = True
     per_run: ClassVar[bool] = True
+    past: ClassVar[bool] = True
     fingerprint: ClassVar[str] = (
         "The residual lasts until the voltage first exceeds all before, and is gone from there on."
     )
