@@ -122,6 +122,10 @@ def conclude(
     named = name_faults(faults, cyclic, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults)
+    if all(run.has_past for run in baseline.runs):
+        # It is fitted as one more part of the past that is estimated, which is beside all that is asked.
+        causes = tuple(one for one in causes if not card_of(one.name).past)
+        extension = extension if causes else extend_stage(ready, found, None)
     bound = {law.form.name.replace("_", " ") for law, x in zip(model.laws, model.x, strict=True) if law.at_bound(x)}
     if bound:
         remarks.append(
@@ -156,7 +160,7 @@ def conclude(
         in_band, left_over = False, True
         excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
-    unexplained = left_over and not kept and not in_band
+    unexplained = left_over and not causes and not in_band
     compared = extension.compared
     if baseline.aside:
         # What was kept aside of the fitted runs has been looked at.
@@ -256,7 +260,8 @@ def _gain(
         # A command that is played slowly does not meet what only fast ones do.
         if before > _MET * baseline.stroke_um:
             gain = replace(gain, feedforward_before_um=before, feedforward_after_um=after)
-    return gain, sorted({effect.name for effect in extension.effects if effect.per_run and len(baseline.runs) > 1})
+    own = {one.name for one in extension.effects if one.per_run and not one.past and len(baseline.runs) > 1}
+    return gain, sorted(own)
 
 
 def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float) -> Faults:

@@ -56,12 +56,11 @@ class Bench:
         return at_samples(signals(stage, one, self.stage, self.known[run])[-1], one)
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
-        """Those that a run may be asked about: none that is its own and too fast for its samples, or its past."""
+        """Those that a run may be asked about: none that is its own and too fast for its samples."""
         record = prepared.run.record
         interval_s = float(np.median(np.diff(record.time_s)))
         slow = not self.resonance_Hz * interval_s > _PERIOD
         asked = [effect for effect in effects if slow or not (effect.fast and effect.per_run)]
-        asked = [effect for effect in asked if not (effect.past and prepared.run.has_past)]
         return [without_drifts(effect, interval_s, record.duration_s) for effect in asked]
 
     def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:

@@ -81,8 +81,6 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
     """Why an effect cannot be asked about, as the end of a sentence; None where it can."""
     if form.fast and not baseline.dynamic:
         return "the runs do not show the dynamics"
-    if form.past and all(run.has_past for run in baseline.runs):
-        return "what went on before the runs is estimated; state the initial memory to have it tested"
     beside = [set(columns_beside(run.record)) for run in (*baseline.runs, *baseline.aside)]
     everywhere = set.intersection(*beside)
     for name in form.needs:

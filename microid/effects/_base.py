@@ -97,7 +97,7 @@ class AbstractEffect(AbstractPart):
     per_run
         Whether it differs from record to record, as a drift does.
     past
-        Whether it is what the hysteresis remembers from before a record, which may be estimated without it.
+        Whether it is what the hysteresis remembers from before a record: no cause where that is estimated.
     finite
         Whether it must be tried at its full size, because at zero it has no derivative, or none that says much.
     repeats
