@@ -11,6 +11,7 @@ from test_diagnosis_parts import WHITE, regression
 from test_diagnosis_tangent import baseline_of
 
 from fits import Record
+from fits.diagnosis import _misfit
 from fits.diagnosis._discrepancy import smoothed
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._projector import Projector
@@ -24,6 +25,7 @@ from fits.diagnosis._residual_tests import (
     repeats_in,
     run_regressors,
 )
+from fits.diagnosis._select import Selection
 from fits.stats._band import Band
 from fits.stats._noise import Noise
 
@@ -264,3 +266,12 @@ def test_a_prior_is_as_smooth_as_the_density(rng):
         off = np.linalg.norm(held + smooth - truth) / np.linalg.norm(flat + smooth - truth)
         assert off < (0.7 if truth is smooth else 1.05)
     assert stiffness[0] > 10 * stiffness[1]
+
+
+def test_where_all_causes_were_left_out_nothing_is_told_beside_what_they_had_taught(monkeypatch):
+    """Beside causes a density may be less rough: it has fewer unknowns then, and rows, than without them."""
+    monkeypatch.setattr(_misfit, "nothing", lambda _, projector: SimpleNamespace(cost=9.0, rows=projector.rows))
+    smooth, rough = (SimpleNamespace(rows=rows) for rows in (10, 74))
+    before = Selection((), *(None,) * 6, *(SimpleNamespace(beside=lambda _, one=one: one) for one in (smooth, rough)))
+    told = _misfit._in_noise(before, ())
+    assert told.model.rows == told.projector.rows == 74

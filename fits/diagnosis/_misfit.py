@@ -67,7 +67,9 @@ class Misfit:
 
 def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
     """What was found, in units of other noise."""
-    first, now = (one.beside(noise) for one in (found.first, found.projector))
+    first = found.first.beside(noise)
+    # Where all causes were left out, nothing was learnt beside them.
+    now = found.projector.beside(noise) if found.causes else first
     plain = nothing(found.bench, first)
     model = refit(found.bench, now, found.model.laws, found.model.x, 2) if found.causes else plain
     explained = max(plain.cost - model.cost, 0.0)
