@@ -125,7 +125,8 @@ def conclude(
     if all(run.has_past for run in baseline.runs):
         # It is fitted as one more part of the past that is estimated, which is beside all that is asked.
         causes = tuple(one for one in causes if not card_of(one.name).past)
-        extension = extension if causes else extend_stage(ready, found, None)
+        if kept and all(card_of(one.name).past for one in kept):
+            extension = extend_stage(ready, found, None)
     bound = {law.form.name.replace("_", " ") for law, x in zip(model.laws, model.x, strict=True) if law.at_bound(x)}
     if bound:
         remarks.append(

@@ -87,7 +87,8 @@ def diagnose(
     seed
         Of the draws that calibrate the false alarms.
     budget_s
-        Seconds after which nothing more is asked: the best answer so far is refined, and what was not asked is said.
+        Seconds for all of it: after three quarters nothing more is asked, the best answer so far is refined, and what
+        was not asked is said.
     thresholds
         What else decides.
     progress
