@@ -74,6 +74,14 @@ class Refit:
         laws[k], x[k] = law, law.start
         return laws, x
 
+    def with_last(self, k: int) -> "Refit":
+        """The same, one of the laws being the last."""
+        order = [*(i for i in range(len(self.laws)) if i != k), k]
+        owner = np.repeat(np.arange(len(self.laws)), [law.size for law in self.laws])
+        columns = np.concatenate([np.flatnonzero(owner == i) for i in order])
+        laws, x = tuple(self.laws[i] for i in order), tuple(self.x[i] for i in order)
+        return replace(self, laws=laws, x=x, tangent=self.tangent[:, columns])
+
     def covariance(self, robust: bool = True) -> np.ndarray:
         """Of all coordinates together.
 

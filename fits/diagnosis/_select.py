@@ -22,7 +22,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
-from fits.stats._compare import improvement_z
+from fits.stats._compare import improvement_z, is_worse
 from fits.stats._score_test import standard_deviations
 from microid.effects import EFFECTS, card_of
 
@@ -186,7 +186,7 @@ def select(
         # The best of each set before the second best of any: effects of one class would take all places.
         beam = [one for _, one in sorted(near, key=lambda one: one[0])[:_BEAM]]
     best = _best(ends, plain, thresholds)
-    return _refined(_without_outdone(best, ends, thresholds, plain), start, search)
+    return _refined(_with_equals(best, ends, thresholds, plain), start, search)
 
 
 def _best(ends: Sequence[Explanation], plain: Refit, thresholds: Thresholds) -> Explanation:
@@ -241,7 +241,7 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )
         refused |= {s.name for s in leaders(open_, bench.baseline.dynamic)} - {rival.name for rival in fitted}
-        found, before = [], projector.held_out(model.change_um)
+        found, vetoed, before = [], False, projector.held_out(model.change_um)
         for rival in [rival for rival in fitted if rival.end is not None]:
             refused.add(rival.name)
             end, drop = rival.end, model.cost - rival.refit.cost
@@ -261,6 +261,9 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
                 continue
             if one.family.p(z / sigma) >= false_alarm or rival.criterion > one.criterion:
                 continue
+            if taken and is_worse(before, rival.held_out, thresholds.worse_z, thresholds.model_error):
+                vetoed = True
+                continue
             same = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
             rivals = tuple(replace(other, end=None) for other in same)
             behind = tuple(other.name for other in same if other.criterion < rival.criterion)
@@ -268,6 +271,9 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
             found.append(Explanation.of((*one.causes, *causes), end, search))
         if found:
             return _that_every_rig_has(found, bench)
+        if vetoed:
+            # What explains most of the rest does so wrongly: what explains less would be named in its place.
+            break
     return []
 
 
@@ -280,22 +286,30 @@ def _that_every_rig_has(found: list[Explanation], bench: Bench) -> list[Explanat
     return first[:1] if first and not card_of(found[0].causes[-1].name).universal else found
 
 
-def _without_outdone(
-    best: Explanation, ends: Sequence[Explanation], thresholds: Thresholds, plain: Refit
-) -> Explanation:
-    """The best without rivals of its causes that explain less in the end, whatever was put beside them."""
-    apart = confusable_z(plain.cost - best.model.cost, thresholds) ** 2
+def _with_equals(best: Explanation, ends: Sequence[Explanation], thresholds: Thresholds, plain: Refit) -> Explanation:
+    """The best, and with each of its causes the effects that explain as much in its place in the end.
+
+    Those that explain less there, whatever was put beside them, are none of them.
+    """
+    least = best.criterion + confusable_z(plain.cost - best.model.cost, thresholds) ** 2
     causes = []
     for at, cause in enumerate(best.causes):
-        outdone = set()
-        for rival in cause.rivals:
-            instead = {*(other.name for other in best.causes[:at]), rival.name}
-            theirs = [
-                end.criterion for end in ends if end is not best and {c.name for c in end.causes[: at + 1]} == instead
-            ]
-            if theirs and min(theirs) > best.criterion + apart:
-                outdone.add(rival.name)
-        causes.append(replace(cause, rivals=tuple(rival for rival in cause.rivals if rival.name not in outdone)))
+        before = {other.name for other in best.causes[:at]}
+        reached: dict[str, float] = {}
+        equals: dict[str, Rival] = {}
+        for end in (end for end in ends if end is not best):
+            first = {other.name for other in end.causes[: at + 1]}
+            if before < first and len(first) == len(before) + 1:
+                (name,) = first - before
+                reached[name] = min(reached.get(name, np.inf), end.criterion)
+            instead = {*end.names} - ({*best.names} - {cause.name})
+            if len(instead) == 1 and len(end.names) == len(best.names) and end.criterion <= least:
+                (name,) = instead
+                found = end.model.with_last([other.name for other in end.causes].index(name))
+                equals[name] = Rival.of(end.projector, found)
+        rivals = {rival.name: rival for rival in cause.rivals if not reached.get(rival.name, -np.inf) > least}
+        more = {name: rival for name, rival in equals.items() if name not in {*rivals, *best.names}}
+        causes.append(replace(cause, rivals=(*rivals.values(), *more.values())))
     return replace(best, causes=tuple(causes))
 
 

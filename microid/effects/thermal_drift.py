@@ -11,7 +11,7 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _times_of, register
-from microid.effects._grids import _decades
+from microid.effects._grids import _decades, _SOONEST_s
 
 
 @register
@@ -87,12 +87,12 @@ class ExponentialThermalDrift(AbstractEffect):
     view: ClassVar[View] = "time"
     column: ClassVar[str] = "temperature_degC"
     change_um: Float[Array, ""] = param(unit="um", scale=0.1)
-    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Time constants in steps of half a decade, from a thirtieth of the record to three of it."""
-        grid = _decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
+        grid = _decades(max(scales.duration_s / 30, 2 * _SOONEST_s), 3 * scales.duration_s, 2)
         return tuple((cls(jnp.asarray(3 * scales.noise_um), jnp.asarray(constant)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:

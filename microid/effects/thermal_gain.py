@@ -10,7 +10,7 @@ from microid._linear import Times
 from microid._param import _as_inexact, array, param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _rate_of, _times_of, register
-from microid.effects._grids import _decades
+from microid.effects._grids import _decades, _SOONEST_s
 
 
 @register
@@ -108,17 +108,17 @@ class SelfHeating(AbstractEffect):
     view: ClassVar[View] = "time"
     column: ClassVar[str] = "temperature_degC"
     gain: Float[Array, ""] = param(unit="1", scale=0.01)
-    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
     reference_V2_per_s: Float[Array, ""] = array()
     zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
-        """Time constants in steps of half a decade, from a thirtieth of the record to ten of it."""
+        """Time constants in steps of half a decade, from a thirtieth of the record, or what heat takes, to ten."""
         losses = max(abs(scales.lower_V), abs(scales.upper_V)) * scales.fastest_V_per_s / 2
         if not losses > 0:
             return ()
-        grid = _decades(max(scales.duration_s / 30, 2e-3), 10 * scales.duration_s, 2)
+        grid = _decades(max(scales.duration_s / 30, 2 * _SOONEST_s), 10 * scales.duration_s, 2)
         return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant), jnp.asarray(losses)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
@@ -163,13 +163,13 @@ class ApproachingGain(AbstractEffect):
     view: ClassVar[View] = "time"
     column: ClassVar[str] = "temperature_degC"
     gain: Float[Array, ""] = param(unit="1", scale=0.01)
-    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=1e-3, upper=1e6)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
     zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Time constants in steps of half a decade, from a thirtieth of the record to three of it."""
-        grid = _decades(scales.duration_s / 30, 3 * scales.duration_s, 2)
+        grid = _decades(max(scales.duration_s / 30, 2 * _SOONEST_s), 3 * scales.duration_s, 2)
         return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant)),) for constant in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:

@@ -1,0 +1,92 @@
+"""Which sets of causes are followed, and what explains as much as a cause in the end: by made-up explanations."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fits.diagnosis import _select
+from fits.diagnosis._select import Cause, Explanation
+from fits.diagnosis._thresholds import THRESHOLDS
+from microid.effects import EFFECTS
+
+FORMS = {form.name: form for form in EFFECTS}
+
+
+class Fitted:
+    """A fit of some effects that leaves a sum of squares."""
+
+    def __init__(self, names, cost):
+        self.laws = tuple(SimpleNamespace(size=1, form=FORMS[name]) for name in names)
+        self.cost, self.change_um = cost, ()
+
+    def is_noise(self, projector, z):
+        return False
+
+    def determined(self, *_):
+        return True
+
+    def with_last(self, k):
+        return self.laws[k].form.name
+
+
+def explanation(names, criterion, cost=1000.0, left=(), held=None, rivals=()):
+    causes = tuple(Cause(name, 50.0, 0.0, tuple(SimpleNamespace(name=one) for one in rivals), 1e4) for name in names)
+    projector = SimpleNamespace(held_out=lambda _: held, count=1000, freedom=10.0)
+    bench = SimpleNamespace(baseline=SimpleNamespace(dynamic=False, runs=[SimpleNamespace(held_out=np.ones(1))]))
+    family = SimpleNamespace(p=lambda z: 0.0)
+    return Explanation(causes, bench, projector, Fitted(names, cost), tuple(left), family, criterion, criterion)
+
+
+@pytest.mark.parametrize(("behind", "named"), [(20.0, {"sensor_lowpass"}), (1e4, set())])
+def test_what_explains_as_much_in_the_end_is_an_alternative(monkeypatch, behind, named):
+    # A low-pass had been ahead of a delay only until what happened before the run was fitted beside both.
+    monkeypatch.setattr(_select.Rival, "of", lambda projector, found: SimpleNamespace(name=found))
+    best = explanation(("transport_delay", "initial_state"), 2000.0)
+    other = explanation(("sensor_lowpass", "initial_state"), 2000.0 + behind)
+    plain = SimpleNamespace(cost=20_000.0)
+    found = _select._with_equals(best, [best, other], THRESHOLDS, plain)
+    assert [{rival.name for rival in cause.rivals} for cause in found.causes] == [named, set()]
+
+
+def test_what_explains_less_in_the_end_is_none(monkeypatch):
+    best = explanation(("transport_delay", "creep"), 2000.0, rivals=("sensor_lowpass",))
+    other = explanation(("sensor_lowpass", "backlash"), 9000.0)
+    found = _select._with_equals(best, [best, other], THRESHOLDS, SimpleNamespace(cost=20_000.0))
+    assert found.causes[0].rivals == ()
+
+
+@pytest.mark.parametrize(("grown", "followed"), [(1.3, []), (0.9, ["creep", "backlash"])])
+def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown, followed):
+    # Nor is what explains less than that in its place.
+    held = np.random.default_rng(0).standard_normal(2400)
+    scored = [
+        SimpleNamespace(name=name, form=FORMS[name], z=z, probe=None)
+        for name, z in (("backlash", 40.0), ("aging", 30.0))
+    ]
+    one = explanation(("creep",), 5000.0, cost=4000.0, left=scored, held=held)
+    asked = []
+
+    def compared(bench, projector, model, open_, *_):
+        name = max(open_, key=lambda s: s.z).name
+        asked.append(name)
+        end = (bench, projector, Fitted(("creep", name), 2000.0))
+        errors = held * (grown if name == "backlash" else 0.9)
+        fits = {"refit": Fitted(("creep", name), 2000.0), "criterion": 3000.0, "cost": 2000.0}
+        return [SimpleNamespace(name=name, form=FORMS[name], end=end, held_out=errors, **fits)]
+
+    monkeypatch.setattr(_select, "compare_rivals", compared)
+    monkeypatch.setattr(_select, "leaders", lambda open_, _: open_[:1])
+    monkeypatch.setattr(_select, "indistinguishable", lambda *_: ())
+    monkeypatch.setattr(Explanation, "of", classmethod(lambda cls, causes, state, search: [c.name for c in causes]))
+    monkeypatch.setattr(_select, "_that_every_rig_has", lambda found, _: found)
+    search = SimpleNamespace(
+        plain=SimpleNamespace(cost=20_000.0),
+        thresholds=THRESHOLDS,
+        false_alarm=0.01,
+        has_time=lambda: True,
+        progress=print,
+    )
+    found = _select._grown(one, search)
+    assert (found[0] if found else []) == followed
+    assert asked == ["backlash"]
