@@ -31,7 +31,7 @@ _LONGEST_s = 1e5
     metavar="SECONDS",
     default=300.0,
     show_default=True,
-    help="For all of it; the last quarter refines the answer.",
+    help="For all of it; the last third refines the answer.",
 )
 @click.option("--duration", type=float, metavar="SECONDS", help="Of the next experiment, at most.")
 @options.initial("all runs", "unknown")

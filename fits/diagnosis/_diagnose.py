@@ -27,7 +27,7 @@ from microid.effects import card_of
 _CHECK = 0.12
 # Parts of the budget after which the stage is not fitted in yet another way before effects are asked for, and after
 # which no more are asked for: what was found is refined in the rest.
-_PREPARED, _ASKED = 0.5, 0.75
+_PREPARED, _ASKED = 0.5, 0.65
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
 _ALL = (
@@ -87,7 +87,7 @@ def diagnose(
     seed
         Of the draws that calibrate the false alarms.
     budget_s
-        Seconds for all of it: after three quarters nothing more is asked, the best answer so far is refined, and what
+        Seconds for all of it: after two thirds nothing more is asked, the best answer so far is refined, and what
         was not asked is said.
     thresholds
         What else decides.
