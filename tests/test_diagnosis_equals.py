@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fits.diagnosis import _select
+from fits.diagnosis._conclude import verdict_of
 from fits.diagnosis._select import Cause, Explanation
 from fits.diagnosis._thresholds import THRESHOLDS
 from microid.effects import EFFECTS
@@ -90,3 +91,18 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
     found = _select._grown(one, search)
     assert (found[0] if found else []) == followed
     assert asked == ["backlash"]
+
+
+@pytest.mark.parametrize(
+    ("made_um", "left_um", "explained", "verdict"),
+    [
+        ((0.007,), 0.04, False, "unexplained"),
+        ((0.05,), 0.04, False, "effect_found"),
+        ((0.007,), 0.04, True, "effect_found"),
+        ((), 0.04, False, "unexplained"),
+        ((), 0.0, False, "no_effect"),
+    ],
+)
+def test_bad_samples_are_no_answer_to_more_than_they_make(made_um, left_um, explained, verdict):
+    # Five peaks of bursts that nobody recorded had passed for what was wrong.
+    assert verdict_of([SimpleNamespace(rms_um=um) for um in made_um], left_um, explained) == verdict

@@ -81,6 +81,7 @@ def test_a_lag_that_does_not_show_is_followed_as_far_as_it_may_be(rng):
     away = np.maximum(np.sqrt(np.array(costs) - lowest), 3)
     # How many steps it takes is chance.
     assert len(along) > 2
+    assert profile_likelihood(case.bench, case.projector, case.model, 0, covariance, lambda: False) == []
     np.testing.assert_allclose([one for one, _ in along], away, atol=0.05)
     # An expansion goes a little way at a time; for lags far beyond the record it would have far to go.
     near = np.abs(sizes) < 0.3

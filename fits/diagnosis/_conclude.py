@@ -20,7 +20,7 @@ from fits.diagnosis._extension import (
     without_effects,
 )
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
-from fits.diagnosis._misfit import worth_naming
+from fits.diagnosis._misfit import SHOWN, worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import ONE_WAY, Prepared
 from fits.diagnosis._refit import Refit
@@ -30,7 +30,7 @@ from fits.diagnosis._residual_tests import (
     irregular,
     run_regressors,
 )
-from fits.diagnosis._result import Diagnosis, Gain, RunView, Step, Test
+from fits.diagnosis._result import Diagnosis, FoundCause, Gain, RunView, Step, Test, Verdict
 from fits.diagnosis._select import Selection
 from fits.io._length import length
 from fits.io._limits import measured_ranges
@@ -54,11 +54,12 @@ def conclude(
     false_alarm: float,
     progress: Callable[[str], None],
     request: Request | None,
+    has_time: Callable[[], bool] = lambda: True,
 ) -> Diagnosis:
     """Decide on the verdict, extend the stage, measure the gain, and say what else is to be said.
 
     `records` are those whose warnings are passed on; for `false_alarm` and `request` see `diagnose`. There is no
-    request where the time is over.
+    request where the time is over, and where it no longer `has_time` intervals are not followed.
     """
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
@@ -90,7 +91,8 @@ def conclude(
     if kept and (misfit.share < thresholds.explained_share or worse):
         why = f"what was held out is predicted {'no better' if weak or small else 'worse'} with that"
         if misfit.share < thresholds.explained_share:
-            why = f"that explains only {100 * misfit.share:.0f} % of it"
+            share = "hardly any" if misfit.share < SHOWN else f"only {100 * misfit.share:.0f} %"
+            why = f"that explains {share} of it"
         remarks.append(not_named([cause.name for cause in kept], why))
         model, kept = found.plain, ()
         rest_noise, left_over = misfit.unnamed(weak or small)
@@ -121,7 +123,11 @@ def conclude(
     )
     named = name_faults(faults, cyclic, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
-    causes = causes_of(kept, model, found, removed, named, ready.faults)
+    causes = causes_of(kept, model, found, removed, named, ready.faults, has_time)
+    if kept and not has_time():
+        remarks.append(
+            "the time was over: intervals of what was found are those of its curvature, and may be too narrow"
+        )
     if all(run.has_past for run in baseline.runs):
         # It is fitted as one more part of the past that is estimated, which is beside all that is asked.
         causes = tuple(one for one in causes if not card_of(one.name).past)
@@ -161,7 +167,8 @@ def conclude(
         in_band, left_over = False, True
         excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
-    unexplained = left_over and not causes and not in_band
+    unexplained_um = rest_noise * noise_um if left_over else 0.0
+    moving = [cause for cause in causes if not card_of(cause.name).statistic]
     compared = extension.compared
     if baseline.aside:
         # What was kept aside of the fitted runs has been looked at.
@@ -184,12 +191,12 @@ def conclude(
         extended_band = sure.predictions(extension.stage, left_um, extension.own)
     likely = {cause.name for cause in causes} | {rival.name for cause in kept for rival in cause.rivals}
     return Diagnosis(
-        verdict="unexplained" if unexplained else "effect_found" if causes else "no_effect",
+        verdict=verdict_of(causes, unexplained_um, bool(moving) or in_band),
         noise_um=noise_um,
         noise_source=ready.faults.source,
         noise_samples=float(np.mean([noise.correlation_samples for noise in found.projector.noise])),
         causes=causes,
-        unexplained_rms_um=rest_noise * noise_um if left_over else 0.0,
+        unexplained_rms_um=unexplained_um,
         upper_bounds=bounds(found, ready, found.left if kept else found.scores, likely),
         tests=(*_tests(ready, told), *unlike),
         gain=gain,
@@ -212,6 +219,17 @@ def conclude(
             ],
         },
     )
+
+
+def verdict_of(causes: Sequence[FoundCause], left_um: float, explained: bool) -> Verdict:
+    """The verdict, where so much is left beyond noise, root mean square, and more than noise was `explained`.
+
+    A few bad samples or coarse readings are no answer to more than they make.
+    """
+    made_um = float(np.hypot.reduce([cause.rms_um for cause in causes], initial=0.0))
+    if left_um > 0 and not explained and not made_um >= left_um:
+        return "unexplained"
+    return "effect_found" if causes else "no_effect"
 
 
 def not_named(suspects: Sequence[str], why: str) -> str:

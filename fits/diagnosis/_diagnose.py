@@ -25,9 +25,9 @@ from microid.effects import card_of
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
-# Parts of the budget after which the stage is not fitted in yet another way before effects are asked for, and after
-# which no more are asked for: what was found is refined in the rest.
-_PREPARED, _ASKED = 0.5, 0.65
+# Parts of the budget after which the stage is not fitted in yet another way before effects are asked for, no more are
+# asked for as what was found is refined in the rest, and intervals of what was found are not followed.
+_PREPARED, _ASKED, _REFINED = 0.5, 0.65, 0.85
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
 _ALL = (
@@ -135,18 +135,20 @@ def diagnose(
     rng, begin_s = np.random.default_rng(seed), time.monotonic()
     end_s = begin_s + budget_s
 
-    def has_time() -> bool:
-        return time.monotonic() < begin_s + _ASKED * budget_s
+    def before(part: float) -> Callable[[], bool]:
+        return lambda: time.monotonic() < begin_s + part * budget_s
+
+    has_time = before(_ASKED)
 
     def answer(reading: Reading, *remarks: str) -> Diagnosis:
-        ready = prepare_diagnosis(reading, progress, lambda: time.monotonic() < begin_s + _PREPARED * budget_s)
+        ready = prepare_diagnosis(reading, progress, before(_PREPARED))
         remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
         ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
         found = select(*stage, false_alarm, rng, progress, thresholds, has_time)
         request = Request(duration_s, limits, margin, has_time) if has_time() else None
-        return conclude(ready, found, [*records, *aside], false_alarm, progress, request)
+        return conclude(ready, found, [*records, *aside], false_alarm, progress, request, before(_REFINED))
 
     reading = Reading(records, aside, fraction, initial, thresholds)
     diagnosis = answer(reading)

@@ -1,7 +1,7 @@
 """What was found, in the terms of its users: parameters with intervals, shares, and bounds of what was not found."""
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -46,10 +46,12 @@ def causes_of(
     explained: tuple[float, float],
     faults: Sequence[Fault],
     noise: Faults,
+    has_time: Callable[[], bool] = lambda: True,
 ) -> tuple[FoundCause, ...]:
     """Describe the causes, the most important first: by what each removes of what all have `explained`.
 
-    The latter are a part of the misfit, and a mean square in um^2.
+    The latter are a part of the misfit, and a mean square in um^2. Intervals follow the likelihood as long as it
+    `has_time`, and then its curvature.
     """
     found: dict[str, FoundCause] = {}
     weight: defaultdict[str, float] = defaultdict(float)
@@ -66,7 +68,8 @@ def causes_of(
         rms_um, part = seen * _rms(alone, projector), cause.drop / whole
         share = part * explained[0]
         weight[cause.name] += part * explained[1]
-        parameters = _parameters(law, x, block, profile_likelihood(bench, projector, model, number, block))
+        along = profile_likelihood(bench, projector, model, number, block, has_time)
+        parameters = _parameters(law, x, block, along)
         if cause.name in found:
             first, count = found[cause.name], [one.name for one in causes[: number + 1]].count(cause.name)
             more = (replace(one, name=f"{one.name}, number {count}") for one in parameters)
@@ -164,7 +167,12 @@ def _parameters(
 
 
 def profile_likelihood(
-    bench: Bench, projector: Projector, model: Refit, which: int, covariance: np.ndarray
+    bench: Bench,
+    projector: Projector,
+    model: Refit,
+    which: int,
+    covariance: np.ndarray,
+    has_time: Callable[[], bool] = lambda: True,
 ) -> list[tuple[float, np.ndarray]]:
     """Profile of the likelihood over nonlinear parameters of one law: coordinates, and how many deviations away.
 
@@ -178,7 +186,7 @@ def profile_likelihood(
     for path, at in law.common.items():
         if _is_nonlinear(law, x, at, float(sd[at])):
             for way in (-1, 1):
-                found += _profile_to(bench, projector, model, which, path, at, way)
+                found += _profile_to(bench, projector, model, which, path, at, way, has_time)
     lowest = min([model.cost, *(cost for cost, _ in found)])
     return [(max((cost - lowest) ** 0.5, _FAR_Z), there) for cost, there in found]
 
@@ -192,13 +200,22 @@ def _is_nonlinear(law: Law, x: np.ndarray, at: int, sd: float) -> bool:
 
 
 def _profile_to(
-    bench: Bench, projector: Projector, model: Refit, which: int, path: str, at: int, way: int
+    bench: Bench,
+    projector: Projector,
+    model: Refit,
+    which: int,
+    path: str,
+    at: int,
+    way: int,
+    has_time: Callable[[], bool],
 ) -> list[tuple[float, np.ndarray]]:
     """Costs and coordinates of a law with one held farther and farther to one side, and then less far again."""
     law, found = model.laws[which], list[tuple[float, np.ndarray]]()
     step, last, outside = _STEP, model, None
     inside = float(_coordinates(model, which, law)[at])
     for _ in range(_STEPS):
+        if not has_time():
+            break
         place = inside + way * step if outside is None else (inside + outside) / 2
         moved = np.array(_coordinates(last, which, law))
         moved[at] = place

@@ -15,6 +15,9 @@ from fits.stats._cycles import Cycles
 from fits.stats._noise import Noise
 from microid.effects import card_of
 
+# A share below this is hardly any.
+SHOWN = 0.005
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -116,8 +119,12 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     part = replace(misfit, explained=fewer.cost - found.model.cost).share
     if card_of(name).independent or part >= thresholds.minor_share:
         return None
-    share = f"{max(100 * part, 0.0):.0f} % of what the other causes leave"
-    return part, name, f"it would explain {share}, and what makes the rest may look like that"
+    share = f"{100 * part:.0f} %" if part > SHOWN else "hardly any"
+    return (
+        part,
+        name,
+        f"it would explain {share} of what the other causes leave, and what makes the rest may look like that",
+    )
 
 
 def _without(found: Selection, name: str) -> Refit:

@@ -137,9 +137,13 @@ class PlainFit:
             return gained(holds) + self.largest_z(self.left_under(holds)) ** 2
 
         def shared(holds: Holds) -> Holds:
-            """The same with runs that do not show their own way going as the others do."""
+            """The same with runs that do not show their own way going as the others do.
+
+            Of what more than noise is left in any way, a small part shows none.
+            """
             alike = max(((way,) * len(holds) for way in dict.fromkeys(holds)), key=gained)
-            return alike if gained(alike) > gained(holds) - least else holds
+            own = max(least, off * (whole - len(self.left)))
+            return alike if gained(alike) > gained(holds) - own else holds
 
         if "zero" in found and found != taken:
             return shared(found) if gained(found) > least and beside(found) > (1 - off) * best else taken
