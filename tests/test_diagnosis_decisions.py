@@ -12,11 +12,11 @@ import fits
 from fits import Record
 from fits.diagnosis import _diagnose, _findings, _misfit
 from fits.diagnosis._effects import Law
+from fits.diagnosis._explanation import Cause, Selection
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._misfit import Misfit
 from fits.diagnosis._prepare import Prepared, _covered
 from fits.diagnosis._result import Gain
-from fits.diagnosis._select import Cause, Selection
 from fits.diagnosis._thresholds import Thresholds
 from fits.stage._fit import default_stage
 from fits.stats._compare import improvement_z

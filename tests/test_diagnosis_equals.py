@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fits.diagnosis import _select
+from fits.diagnosis import _explanation, _select
 from fits.diagnosis._conclude import verdict_of
-from fits.diagnosis._select import Cause, Explanation
+from fits.diagnosis._explanation import Cause, Explanation, best_of_ends, with_equals
 from fits.diagnosis._thresholds import THRESHOLDS
 from microid.effects import EFFECTS
 
@@ -36,24 +36,24 @@ def explanation(names, criterion, cost=1000.0, left=(), held=None, rivals=()):
     projector = SimpleNamespace(held_out=lambda _: held, count=1000, freedom=10.0)
     bench = SimpleNamespace(baseline=SimpleNamespace(dynamic=False, runs=[SimpleNamespace(held_out=np.ones(1))]))
     family = SimpleNamespace(p=lambda z: 0.0)
-    return Explanation(causes, bench, projector, Fitted(names, cost), tuple(left), family, criterion, criterion)
+    return Explanation(causes, bench, projector, Fitted(names, cost), tuple(left), family, criterion, criterion, held)
 
 
 @pytest.mark.parametrize(("behind", "named"), [(20.0, {"sensor_lowpass"}), (1e4, set())])
 def test_what_explains_as_much_in_the_end_is_an_alternative(monkeypatch, behind, named):
     # A low-pass had been ahead of a delay only until what happened before the run was fitted beside both.
-    monkeypatch.setattr(_select.Rival, "of", lambda projector, found: SimpleNamespace(name=found))
+    monkeypatch.setattr(_explanation.Rival, "of", lambda projector, found: SimpleNamespace(name=found))
     best = explanation(("transport_delay", "initial_state"), 2000.0)
     other = explanation(("sensor_lowpass", "initial_state"), 2000.0 + behind)
     plain = SimpleNamespace(cost=20_000.0)
-    found = _select._with_equals(best, [best, other], THRESHOLDS, plain)
+    found = with_equals(best, [best, other], THRESHOLDS, plain)
     assert [{rival.name for rival in cause.rivals} for cause in found.causes] == [named, set()]
 
 
 def test_what_explains_less_in_the_end_is_none(monkeypatch):
     best = explanation(("transport_delay", "creep"), 2000.0, rivals=("sensor_lowpass",))
     other = explanation(("sensor_lowpass", "backlash"), 9000.0)
-    found = _select._with_equals(best, [best, other], THRESHOLDS, SimpleNamespace(cost=20_000.0))
+    found = with_equals(best, [best, other], THRESHOLDS, SimpleNamespace(cost=20_000.0))
     assert found.causes[0].rivals == ()
 
 
@@ -106,3 +106,16 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
 def test_bad_samples_are_no_answer_to_more_than_they_make(made_um, left_um, explained, verdict):
     # Five peaks of bursts that nobody recorded had passed for what was wrong.
     assert verdict_of([SimpleNamespace(rms_um=um) for um in made_um], left_um, explained) == verdict
+
+
+@pytest.mark.parametrize(
+    ("ahead", "grown", "best"), [(300.0, 1.6, "creep"), (300.0, 1.0, "rate"), (5e3, 1.6, "rate")]
+)
+def test_of_what_is_not_told_apart_the_one_that_predicts_better_is_taken(monkeypatch, ahead, grown, best):
+    # A rate dependence and a hysteresis of its own had won over the creep that predicted the rest of the run.
+    monkeypatch.setattr(Explanation, "near_bound", False)
+    held = np.random.default_rng(1).standard_normal(2400)
+    creep = explanation(("mains_hum", "creep"), 20_000.0, held=held)
+    other = explanation(("mains_hum", "rate_dependence"), 20_000.0 - ahead, held=grown * held)
+    found = best_of_ends([creep, other], SimpleNamespace(cost=50_000.0), THRESHOLDS)
+    assert found is {"creep": creep, "rate": other}[best]

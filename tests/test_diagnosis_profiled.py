@@ -11,12 +11,12 @@ from test_diagnosis_comparison import NOISE_UM, stage_on
 
 from fits import Record
 from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._explanation import Cause, Explanation, best_of_ends
 from fits.diagnosis._findings import _parameters, profile_likelihood
 from fits.diagnosis._joint_fit import leave_bounds
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import nothing, refit
 from fits.diagnosis._regression import regress
-from fits.diagnosis._select import Cause, Explanation, _best
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._noise import Noise
 from microid import Driver
@@ -210,14 +210,14 @@ def test_of_explanations_that_are_not_told_apart_one_with_nothing_near_its_bound
 
     def explained_by(one):
         criterion = one.criterion(projector.count)
-        return Explanation((), bench, projector, one, (), None, criterion, criterion)
+        return Explanation((), bench, projector, one, (), None, criterion, criterion, np.zeros(0))
 
     bound, free, none = map(explained_by, (stuck, inside, plain))
     # Where there is no effect, there is no bound.
     assert [one.near_bound for one in (bound, free, none)] == [True, False, False]
-    assert _best([none], plain, THRESHOLDS) is none
-    assert _best([bound, free], plain, THRESHOLDS) is free
-    assert _best([bound, none], plain, THRESHOLDS) is bound
+    assert best_of_ends([none], plain, THRESHOLDS) is none
+    assert best_of_ends([bound, free], plain, THRESHOLDS) is free
+    assert best_of_ends([bound, none], plain, THRESHOLDS) is bound
 
 
 def test_causes_that_add_less_than_the_models_of_others_are_off_by_do_not_count():
@@ -226,11 +226,11 @@ def test_causes_that_add_less_than_the_models_of_others_are_off_by_do_not_count(
 
     def explained_by(cost, *names):
         causes = [Cause(name, 50.0, 0.0, (), 1.0) for name in names]
-        return Explanation(tuple(causes), None, None, replace(one, cost=cost), (), None, cost, cost)
+        return Explanation(tuple(causes), None, None, replace(one, cost=cost), (), None, cost, cost, np.zeros(0))
 
     # Models are off by 6 % of 100 standard deviations, those of confusions by 60 %.
     creep = explained_by(10000.0, "creep")
     for name, most in (("slew_limit", 36.0), ("mount_relaxation", 3600.0)):
         for gained, first in ((0.9 * most, creep), (1.1 * most, None)):
             both = explained_by(10000.0 - gained, name, "creep")
-            assert _best([both, creep], plain, THRESHOLDS) is (first or both), name
+            assert best_of_ends([both, creep], plain, THRESHOLDS) is (first or both), name

@@ -13,6 +13,7 @@ from test_diagnosis_tangent import baseline_of
 from fits import Record
 from fits.diagnosis import _misfit
 from fits.diagnosis._discrepancy import smoothed
+from fits.diagnosis._explanation import Selection
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
@@ -25,7 +26,6 @@ from fits.diagnosis._residual_tests import (
     repeats_in,
     run_regressors,
 )
-from fits.diagnosis._select import Selection
 from fits.stats._band import Band
 from fits.stats._noise import Noise
 

@@ -12,6 +12,7 @@ from fits.diagnosis import _baseline
 from fits.diagnosis._comparison import Rival
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._experiment import Request, open_question, refine, suggest
+from fits.diagnosis._explanation import Cause
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._programs import Limits, Program, limits_of, menu, paces
 from fits.diagnosis._projector import Projector
@@ -19,7 +20,7 @@ from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._result import FoundCause
 from fits.diagnosis._score import law_of, probes_of, scales_of, score
-from fits.diagnosis._select import Cause, select
+from fits.diagnosis._select import select
 from fits.loop._run import prepare_run
 from fits.stats._noise import Noise
 from microid.effects import EFFECTS

@@ -8,6 +8,7 @@ import numpy as np
 from fits.diagnosis._certainty import Certainty
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._experiment import Request, suggest
+from fits.diagnosis._explanation import Selection
 from fits.diagnosis._extension import (
     Compared,
     Extension,
@@ -31,7 +32,6 @@ from fits.diagnosis._residual_tests import (
     run_regressors,
 )
 from fits.diagnosis._result import Diagnosis, FoundCause, Gain, RunView, Step, Test, Verdict
-from fits.diagnosis._select import Selection
 from fits.io._length import length
 from fits.io._limits import measured_ranges
 from fits.io._record import Record

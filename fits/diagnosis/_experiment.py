@@ -6,6 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fits.diagnosis._explanation import Selection
 from fits.diagnosis._findings import MOST_RIVALS
 from fits.diagnosis._predict import Hypothesis, Predictor
 from fits.diagnosis._prepare import Prepared
@@ -14,7 +15,6 @@ from fits.diagnosis._refit import Refit
 from fits.diagnosis._result import Experiment, FoundCause
 from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
-from fits.diagnosis._select import Selection
 from fits.io._limits import MARGIN, RangeMap
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.diagnosis._effects import Bench
+from fits.diagnosis._explanation import Selection
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
-from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._run import Run
 from fits.stage._motion import at_samples, signals

@@ -12,13 +12,13 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._explanation import Cause, Selection
 from fits.diagnosis._noise import Fault, Faults
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_around
 from fits.diagnosis._result import Bound, FoundCause
 from fits.diagnosis._score import Scored, best_of
-from fits.diagnosis._select import Cause, Selection
 from fits.loop._result import ParameterEstimate
 from fits.stats._held import Held
 from fits.stats._metrics import TWO_SIDED_95

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from fits.diagnosis._explanation import Selection
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import explain_together, repeats_in, run_regressors
-from fits.diagnosis._select import Selection
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.stats._compare import improvement_z, is_worse
 from fits.stats._cycles import Cycles

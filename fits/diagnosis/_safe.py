@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._baseline import Baseline, with_effects
+from fits.diagnosis._explanation import Selection
 from fits.diagnosis._predict import FARTHEST_DRAW, Hypothesis, next_record
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._programs import Limits, Path, Program, Samples, menu
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._select import Selection
 from fits.io._limits import Extreme, RangeMap, Ranges, allowed, beyond, compared, joined
 from fits.io._record import Record
 from fits.loop._run import known_samples

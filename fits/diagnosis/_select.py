@@ -1,26 +1,25 @@
 """Which effects the records need: a search over sets of causes, with refits, and a backward check."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fits.diagnosis._comparison import (
-    Rival,
     compare_rivals,
     confusable_z,
     criterion,
-    gain_ahead,
     has_occurred,
     indistinguishable,
     leaders,
     model_error,
 )
 from fits.diagnosis._effects import Bench
-from fits.diagnosis._joint_fit import State, is_smoothness_confirmed, refine, relearn_noise
+from fits.diagnosis._explanation import Cause, Explanation, Search, Selection, best_of_ends, with_equals
+from fits.diagnosis._joint_fit import is_smoothness_confirmed, refine, relearn_noise
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
-from fits.diagnosis._score import Family, Probe, Scored, score
+from fits.diagnosis._score import Probe
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.stats._compare import improvement_z, is_worse
 from fits.stats._score_test import standard_deviations
@@ -29,111 +28,7 @@ from microid.effects import EFFECTS, card_of
 # Laws at most, as some causes come several times, sets of causes that are followed at a time, and rounds in which
 # others are fitted where none of the leaders holds.
 _MOST_LAWS, _BEAM, _TRIES = 8, 2, 3
-# The farthest that a standard deviation in coordinates is taken at its word.
-_FARTHEST = 3.0
 _ONCE = {form.name for form in EFFECTS if not form.repeats}
-
-
-@dataclass(frozen=True)
-class Cause:
-    """An effect that the records need.
-
-    `z` is the evidence for it when it was found, in standard deviations, `p_family` the probability of as much
-    evidence for any effect by chance, and `drop` the decrease of the sum of squares, in noise variances. `rivals` are
-    the effects that explain the same about as well, the best first, and `behind` names those that do so better.
-    """
-
-    name: str
-    z: float
-    p_family: float
-    rivals: tuple[Rival, ...]
-    drop: float
-    behind: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Selection:
-    """What the search found: the `causes` in the order in which they were found, and the `model` with all of them.
-
-    `plain` is the baseline without them. `scores` are those of all probes at the baseline, `left` those beside the
-    causes, and `family` gives the chance of the largest. `bench` and `projector` are of the baseline as it is beside
-    the causes, `first` of the one without them. `explained` is what the causes take off the sum of squares beside a
-    baseline that may do all that it may without them; `finest` says whether they were simulated with many steps in
-    the end.
-    """
-
-    causes: tuple[Cause, ...]
-    model: Refit
-    plain: Refit
-    scores: tuple[Scored, ...]
-    left: tuple[Scored, ...]
-    family: Family
-    bench: Bench
-    projector: Projector
-    first: Projector
-    explained: float = 0.0
-    finest: bool = False
-
-
-@dataclass(frozen=True)
-class Search:
-    """What every set of causes is judged by."""
-
-    probes: tuple[Probe, ...]
-    plain: Refit
-    false_alarm: float
-    rng: np.random.Generator
-    progress: Callable[[str], None]
-    thresholds: Thresholds
-    has_time: Callable[[], bool]
-
-    @property
-    def candidates(self) -> list[tuple[np.ndarray, ...]]:
-        """The signatures of all effects."""
-        return [column for probe in self.probes for column in probe.signatures]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A set of causes, and baseline and causes fitted to each other.
-
-    `left` are the scores beside them. The smaller the `criterion`, the better; `promise` is what the best further
-    cause would leave of it.
-    """
-
-    causes: tuple[Cause, ...]
-    bench: Bench
-    projector: Projector
-    model: Refit
-    left: tuple[Scored, ...]
-    family: Family
-    criterion: float
-    promise: float
-
-    @classmethod
-    def of(cls, causes: Sequence[Cause], state: State, search: Search) -> "Explanation":
-        """Ask for all effects beside these causes."""
-        bench, projector, model = state
-        scores = score(projector, search.probes, model.residual, model.basis())
-        names, explained = {cause.name for cause in causes}, search.plain.cost - model.cost
-        ahead = gain_ahead(scores.each, names, explained, search.thresholds)
-        family, left = Family(scores, search.rng), criterion(projector, model)
-        if causes:
-            projector.release()
-        return cls(tuple(causes), bench, projector, model, scores.each, family, left, left - ahead)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the causes, in the order in which they were found, each once."""
-        return tuple(dict.fromkeys(cause.name for cause in self.causes))
-
-    @property
-    def near_bound(self) -> bool:
-        """Whether a cause may, within a standard deviation, be as large as such an effect can be."""
-        sd = np.minimum(np.sqrt(np.diagonal(self.model.covariance(robust=False))), _FARTHEST)
-        each = np.split(sd, np.cumsum([law.size for law in self.model.laws], dtype=int))[:-1]
-        moved = zip(self.model.laws, self.model.x, each, strict=True)
-        return any(law.at_bound(x + way * own) for law, x, own in moved for way in (-1, 0, 1))
 
 
 def select(
@@ -185,27 +80,8 @@ def select(
         near = [one for one in ranked if one[1].criterion < order[0].criterion + reach or one[1].promise < most]
         # The best of each set before the second best of any: effects of one class would take all places.
         beam = [one for _, one in sorted(near, key=lambda one: one[0])[:_BEAM]]
-    best = _best(ends, plain, thresholds)
-    return _refined(_with_equals(best, ends, thresholds, plain), start, search)
-
-
-def _best(ends: Sequence[Explanation], plain: Refit, thresholds: Thresholds) -> Explanation:
-    """The explanation of the smallest criterion; of those that are not told apart, one with no cause near a bound."""
-    ends = [one for one in ends if not any(_adds_little(one, other, plain, thresholds) for other in ends)]
-    first = min(ends, key=lambda one: one.criterion)
-    reach = confusable_z(plain.cost - first.model.cost, thresholds) ** 2
-    return min(ends, key=lambda one: (one.criterion > first.criterion + reach, one.near_bound, one.criterion))
-
-
-def _adds_little(one: Explanation, other: Explanation, plain: Refit, thresholds: Thresholds) -> bool:
-    """Whether one has the causes of another and some that explain no more than the models of those are off by."""
-    if not other.causes or not set(other.names) < set(one.names):
-        return False
-    further = set(one.names) - set(other.names)
-    alike = {*other.names}.union(*(cause.behind for cause in other.causes))
-    off = max(model_error(name, alike, thresholds) for name in further)
-    explained, gained = plain.cost - other.model.cost, other.model.cost - one.model.cost
-    return gained <= off**2 * max(explained, 0.0)
+    best = best_of_ends(ends, plain, thresholds)
+    return _refined(with_equals(best, ends, thresholds, plain), start, search)
 
 
 def _grown(one: Explanation, search: Search) -> list[Explanation]:
@@ -284,33 +160,6 @@ def _that_every_rig_has(found: list[Explanation], bench: Bench) -> list[Explanat
     rivals = {rival.name for rival in found[0].causes[-1].rivals}
     first = [one for one in found if one.causes[-1].name in rivals and card_of(one.causes[-1].name).universal]
     return first[:1] if first and not card_of(found[0].causes[-1].name).universal else found
-
-
-def _with_equals(best: Explanation, ends: Sequence[Explanation], thresholds: Thresholds, plain: Refit) -> Explanation:
-    """The best, and with each of its causes the effects that explain as much in its place in the end.
-
-    Those that explain less there, whatever was put beside them, are none of them.
-    """
-    least = best.criterion + confusable_z(plain.cost - best.model.cost, thresholds) ** 2
-    causes = []
-    for at, cause in enumerate(best.causes):
-        before = {other.name for other in best.causes[:at]}
-        reached: dict[str, float] = {}
-        equals: dict[str, Rival] = {}
-        for end in (end for end in ends if end is not best):
-            first = {other.name for other in end.causes[: at + 1]}
-            if before < first and len(first) == len(before) + 1:
-                (name,) = first - before
-                reached[name] = min(reached.get(name, np.inf), end.criterion)
-            instead = {*end.names} - ({*best.names} - {cause.name})
-            if len(instead) == 1 and len(end.names) == len(best.names) and end.criterion <= least:
-                (name,) = instead
-                found = end.model.with_last([other.name for other in end.causes].index(name))
-                equals[name] = Rival.of(end.projector, found)
-        rivals = {rival.name: rival for rival in cause.rivals if not reached.get(rival.name, -np.inf) > least}
-        more = {name: rival for name, rival in equals.items() if name not in {*rivals, *best.names}}
-        causes.append(replace(cause, rivals=(*rivals.values(), *more.values())))
-    return replace(best, causes=tuple(causes))
 
 
 def _refined(best: Explanation, start: Explanation, search: Search) -> Selection:
