@@ -219,6 +219,7 @@ def test_inspect_says_what_has_to_be_stated(tmp_path):
     path.write_text("Time [s],Drive [%],Gauge [V]\n" + rows(T, V, Y))
     told = json.loads(run("inspect", path, "--json").stdout)
     assert any("'Drive [%]' is in '%'" in remark for remark in told["remarks"])
+    assert "voltage_V=Drive [%][SCALE V]" in told["command"]
     assert any("--columns 'displacement_um=Gauge [V][0.5um]'" in remark for remark in told["remarks"])
     # A count of samples is no time.
     path.write_text("Sample,Voltage (V),Displacement (um)\n" + rows(np.arange(len(T)), V, Y))
@@ -229,6 +230,25 @@ def test_inspect_says_what_has_to_be_stated(tmp_path):
     # What keeps a file from being read is said with its line.
     path.write_text("time_s,voltage_V\n0 s,1 V\n1 s,2 V\n")
     refused(run("inspect", path), "drive.csv, line 2, column 'time_s': expected columns of numbers, found '0 s'")
+
+
+def test_a_drive_in_percent_is_fitted_only_once_its_scale_is_stated(tmp_path, monkeypatch):
+    """The command that was shown took 100 % for 100 V."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.csv").write_text("time_s,drive_%,displacement_um\n" + rows(T, V / 1.2, Y))
+    told = run("inspect", "drive.csv")
+    assert told.stdout.splitlines()[3].split()[:3] == ["2", "drive_%", "%"]
+    words = shlex.split(told.stdout.splitlines()[-1])
+    assert words[words.index("--columns") + 1] == "voltage_V=drive_%[SCALE V]"
+    refused(run(*words[1:]), "column 'drive_%': expected what 1 in the column is", "write a number in place of SCALE")
+    refused(
+        run("fit", "drive.csv", "--columns", "voltage_V=drive_%", "--out", "m.json"), "'voltage_V=drive_%[SCALE V]'"
+    )
+    record = fits.read_table("drive.csv", words[words.index("--columns") + 1].replace("SCALE", "1.2"))
+    np.testing.assert_allclose(record.voltage_V, V, rtol=0, atol=1e-9)
+    assert record.warnings == ()
+    (warning,) = fits.read_table("drive.csv", {"voltage_V": "drive_%[V]"}).warnings
+    assert "column 'drive_%': it is in '%', and 1 of it was read as 1 V" in warning
 
 
 def test_names_of_two_lines_leave_lines_their_numbers(tmp_path):

@@ -1,5 +1,6 @@
 """What a file holds: its channels, what they are probably used for, and how to have it read so."""
 
+import math
 import os
 import re
 import shlex
@@ -10,11 +11,21 @@ import numpy as np
 
 from fits.io._errors import AnyPath, DataError
 from fits.io._open_table import open_table
-from fits.io._quantity import BRACKETS, FloatArray, split_unit
-from fits.io._read_csv import likely_stroke, read_reference, read_table
+from fits.io._plausible import likely_stroke
+from fits.io._quantity import FloatArray, split_unit
+from fits.io._read_csv import read_reference, read_table
 from fits.io._table import Table, data_error
 from fits.io._text_table import is_missing
-from fits.io._units import Source, known_quantity, known_unit, parse_columns, recognise, recognise_again
+from fits.io._units import (
+    Source,
+    known_quantity,
+    known_unit,
+    parse_columns,
+    recognise,
+    recognise_again,
+    scale_of,
+    unscaled_unit,
+)
 
 # Names by which rigs call the columns of a record, whole and in small letters; a minus is for readings of a command.
 _LIKELY = {
@@ -95,7 +106,8 @@ def inspect_table(path: AnyPath) -> Inspection:
         values, use = found.get(name), uses.get(name, "")
         low, high = (None, None) if values is None else (float(values.min()), float(values.max()))
         problem = ", ".join(problems[name][::-1]) if name in problems else ""
-        channels.append(Channel(k, name, known_unit(name), low, high, use, bool(use) and use not in known, problem))
+        unit = known_unit(name) or unscaled_unit(name)
+        channels.append(Channel(k, name, unit, low, high, use, bool(use) and use not in known, problem))
     pairs = [
         f"{column}={_spec(table, source)}"
         for column, source in sources.items()
@@ -114,7 +126,7 @@ def inspect_table(path: AnyPath) -> Inspection:
     command, remarks = _command(os.fspath(path), {*sources}, options, still), [table.remark]
     if timeless and command:
         remarks.append("no column is a time: write the rate of the samples in place of HZ")
-    elif command and not still:
+    elif command and not (still or any(math.isnan(source.scale) for source in sources.values())):
         remarks += _remarks(path, ",".join(pairs), options, {*sources})
     remarks += _unknown_units(table, found, sources)
     rate_Hz = 1 / interval_s if interval_s and interval_s > 0 else None
@@ -139,10 +151,10 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
         if fit:
             best = max(fit, key=lambda name: _score(name, column))
             free.remove(best)
-            multiple = _MULTIPLES_OF_s.get(split_unit(best)[1] or "", 1.0) if column == "time_s" else 1.0
-            guessed[column] = Source(best, known_unit(best) or quantity.unit, scale=multiple)
+            multiple = _MULTIPLES_OF_s.get(split_unit(best)[1] or "") if column == "time_s" else None
+            guessed[column] = Source(best, known_unit(best) or quantity.unit, scale=multiple or scale_of(best))
     moved, driven = guessed.get("displacement_um"), (known | guessed).get("voltage_V")
-    if moved and driven and known_unit(moved.column) is None:
+    if moved and driven and known_unit(moved.column) is None and moved.scale == 1:
         volts = known_quantity("voltage_V").convert(np.ptp(found[driven.column]), driven.unit)
         convert, stroke = known_quantity("displacement_um").convert, np.ptp(found[moved.column])
         strokes = {unit: convert(stroke, unit) for unit in ("um", "nm", "mm", "m")}
@@ -154,12 +166,10 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
 def _unknown_units(table: Table, found: dict[str, FloatArray], sources: dict[str, Source]) -> Iterator[str]:
     """What has to be stated of columns in units that say nothing of V, um or s, such as % or counts."""
     for source in sources.values():
-        unit = split_unit(source.column)[1]
-        unknown = known_unit(source.column) is None and source.scale == 1
-        if unknown and unit and (unit == "%" or BRACKETS.fullmatch(source.column)):
+        if math.isnan(source.scale):
             yield (
-                f"column '{source.column}' is in '{unit}': write what 1 of it is in place of [{source.unit}], as in "
-                f"[0.5{source.unit}]"
+                f"column '{source.column}' is in '{unscaled_unit(source.column)}': write what 1 of it is in place of "
+                f"SCALE, as in [0.5 {source.unit}]"
             )
     moved = sources.get("displacement_um")
     if moved is not None and split_unit(moved.column)[1] is None and moved.scale == 1:

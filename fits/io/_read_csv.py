@@ -1,6 +1,7 @@
 """From a file to a `Record`: what is read, what is refused and what is warned of."""
 
 import os
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,16 +10,19 @@ import numpy as np
 
 from fits.io._errors import AnyPath, DataError
 from fits.io._open_table import open_table
-from fits.io._plausible import SHORTEST_STEP_s, check_size
+from fits.io._plausible import (
+    SHORTEST_STEP_s,
+    STROKE_PER_VOLT_MAX_um_per_V,
+    STROKE_PER_VOLT_MIN_um_per_V,
+    check_size,
+    check_time,
+    likely_stroke,
+)
 from fits.io._quantity import FloatArray
 from fits.io._record import Record, Reference
 from fits.io._table import Problem, Table
-from fits.io._units import Columns, Source, find_sources, known_quantity, pairs_of, recognise
+from fits.io._units import Columns, Source, find_sources, known_quantity, pairs_of, recognise, unscaled_unit
 
-# Piezo stages move 0.01 um/V (stack on a 1000 V amplifier) to 15 um/V (voltage logged before an amplifier of
-# ten-fold gain). Of a typical 0.1 to 1 um/V, slips of 1e3 and 1e6 lie outside these limits.
-STROKE_PER_VOLT_MIN_um_per_V = 0.005
-STROKE_PER_VOLT_MAX_um_per_V = 50.0
 MIN_SAMPLES = 50
 
 
@@ -89,7 +93,7 @@ def read_table(
             "column matters."
         )
     with np.errstate(all="ignore"):  # absurd magnitudes overflow here, and then warn of nothing
-        warnings += [*read.left_out, *read.odd_gaps(), *read.odd_voltage()]
+        warnings += [*read.left_out, *read.odd_units(), *read.odd_gaps(), *read.odd_voltage()]
         if displacement_um is not None:
             warnings += [*read.odd_stroke(), *read.saturated()]
     return Record(time_s, voltage_V, displacement_um, extra, os.path.basename(table.path), tuple(warnings))
@@ -118,7 +122,7 @@ def read_reference(
     needed = ("time_s", "displacement_um")
     read = KnownColumns.read(path, columns, needed, (), sample_rate_Hz, missing)
     with np.errstate(all="ignore"):
-        warnings = (*read.left_out, *read.odd_gaps())
+        warnings = (*read.left_out, *read.odd_units(), *read.odd_gaps())
     source = os.path.basename(read.table.path)
     return Reference(read.arrays["time_s"], read.arrays["displacement_um"], source, warnings)
 
@@ -177,7 +181,7 @@ class KnownColumns:
                 arrays[name] = quantity.convert(source.sign * source.scale * found[source.column], source.unit)
             check_size(table, source.column, arrays[name], quantity.unit, source.unit)
         if interval_s is None:
-            _check_time(table, sources["time_s"].column, arrays["time_s"])
+            check_time(table, sources["time_s"].column, arrays["time_s"])
         else:
             count = np.arange(len(next(iter(found.values())))) if kept is None else np.flatnonzero(kept)
             # A quotient by a whole rate is rounded once, as those are that a file would have.
@@ -190,6 +194,17 @@ class KnownColumns:
         line = "" if row is None else self.table.place(row)
         header = f"column '{self.sources[column].column}'" if column in self.sources else ""
         return ", ".join(filter(None, (self.table.path, line, header)))
+
+    def odd_units(self) -> Iterator[str]:
+        """Columns in % or counts that are read as if 1 of it were 1 V, um or s."""
+        for name, source in self.sources.items():
+            unit = unscaled_unit(source.column)
+            if unit and source.scale == 1:
+                scaled = f"{name}={Source(source.column, source.unit, source.sign, 0.5).spec()}"
+                yield (
+                    f"{self.place(name)}: it is in '{unit}', and 1 of it was read as 1 {source.unit}; if it is not, "
+                    f"state what it is, as in --columns {shlex.quote(scaled)}."
+                )
 
     def odd_gaps(self) -> Iterator[str]:
         """Few long steps in an otherwise even time base; uneven sampling is legal."""
@@ -306,37 +321,8 @@ def _interval_s(table: Table, columns: Mapping[str, str], rate_Hz: float | None)
     return None if "time_s" in columns or "time_s" in known else table.interval_s
 
 
-def _check_time(table: Table, column: str, time_s: FloatArray) -> None:
-    wrong = np.flatnonzero(time_s[1:] <= time_s[:-1])
-    if wrong.size == 0:
-        # Steps of fewer last digits than eight are not even where the clock was.
-        least_s = max(SHORTEST_STEP_s, 8 * float(np.spacing(np.abs(time_s[[0, -1]]).max())))
-        steps_s = np.diff(time_s)
-        if steps_s.min(initial=np.inf) < least_s:
-            what = (
-                f"expected time steps of at least {least_s:.3g} s, which is what double precision resolves here, "
-                f"found {steps_s.min():.3g} s; begin at 0 s, or check the unit"
-            )
-            raise table.error(what, int(np.argmin(steps_s)) + 1, column)
-        return
-    row = int(wrong[0]) + 1
-    before, now = float(time_s[row - 1]), float(time_s[row])
-    if now == before:
-        found = f"{now:.9g} s twice; export the time with more digits, or remove the line"
-    elif row > 1 and now <= time_s[1]:
-        found = f"a restart at {now:.9g} s after {before:.9g} s; split the file here into one file per run"
-    else:
-        found = f"{now:.9g} s after {before:.9g} s; put the lines in order, or split the file into one file per run"
-    raise table.error(f"expected strictly increasing times, found {found}", row, column)
-
-
 def _reversals(values: FloatArray) -> FloatArray:
     """Values at which a signal turns round, shape (number of reversals,)."""
     moves = np.flatnonzero(np.diff(values))
     rising = values[moves + 1] > values[moves]
     return values[moves[1:][rising[1:] != rising[:-1]]]
-
-
-def likely_stroke(ratio_um_per_V: float) -> bool:
-    """Whether a piezo stage moves so far per volt."""
-    return STROKE_PER_VOLT_MIN_um_per_V <= ratio_um_per_V <= STROKE_PER_VOLT_MAX_um_per_V

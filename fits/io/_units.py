@@ -20,6 +20,10 @@ QUANTITIES = (
 _NUMBERED = re.compile(r"-?\d+ *(\[[^\[\]]*\])?")
 # What 1 in a column is, such as 1.2V of a drive in %.
 _SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?) *([^\d\s].*)")
+# What stands for such a number until who measured writes it.
+_UNKNOWN = "SCALE "
+# Units that say nothing of V, um or s: shares of a range, and what converters give.
+_UNSCALED = {"%", "percent", "count", "counts", "cts", "lsb", "digit", "digits"}
 # What a header that stands in a file before is given, so that it can be told from the first.
 _AGAIN = re.compile(r" \d+$")
 # Other names of a quantity.
@@ -32,7 +36,10 @@ Columns = Mapping[str, str | int] | str | None
 
 @dataclass(frozen=True)
 class Source:
-    """Where a canonical column comes from: the source column, its unit, how many of these its 1 is, and its sign."""
+    """Where a canonical column comes from: the source column, its unit, how many of these its 1 is, and its sign.
+
+    How many is NaN where only who measured knows it.
+    """
 
     column: str
     unit: str
@@ -43,7 +50,7 @@ class Source:
         """Write the right-hand side of a mapping that reads this column, optionally changed."""
         sign = -self.sign if flip else self.sign
         unit = unit or self.unit
-        factor = "" if self.scale == 1 else f"{self.scale:.17g}"
+        factor = "" if self.scale == 1 else _UNKNOWN if math.isnan(self.scale) else f"{self.scale:.17g}"
         stated = "" if split_unit(self.column)[1] == factor + unit else f"[{factor}{unit}]"
         return f"{'-' if sign < 0 else ''}{self.column}{stated}"
 
@@ -68,6 +75,18 @@ def known_unit(name: str) -> str | None:
     """The unit that a name ends in, such as `um` of `x[µm]` or of `x_Micrometers`; None where it is no known one."""
     unit = split_unit(name)[1]
     return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
+
+
+def unscaled_unit(name: str) -> str | None:
+    """The unit that a name ends in, such as `%` or counts, where only who measured knows what 1 of it is; or None."""
+    unit = split_unit(name)[1]
+    stated = unit is not None and known_unit(name) is None
+    return unit if stated and (str(unit).lower() in _UNSCALED or BRACKETS.fullmatch(name)) else None
+
+
+def scale_of(name: str) -> float:
+    """How many V, um or s 1 in a column of that name is in its own unit, if its name does not say otherwise."""
+    return math.nan if unscaled_unit(name) else 1.0
 
 
 def pairs_of(columns: Columns) -> Mapping[str, str]:
@@ -189,7 +208,13 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
         found = f"found unit '{unit}'" if unit else "found no unit"
         if scaled and scale != 1:
             found = f"found {scaled[0]} for 1 in the column"
-        option = shlex.quote(f"{column}={text}[{quantity.unit}]")
+        option = shlex.quote(f"{column}={Source(text, quantity.unit, scale=scale_of(text)).spec()}")
+        if unit and unit.startswith(_UNKNOWN):
+            example = shlex.quote(f"{column}={text}[0.5 {quantity.unit}]")
+            raise DataError(
+                f"{place}, column '{text}': expected what 1 in the column is in {quantity.unit}, found '{unit}'; "
+                f"write a number in place of SCALE, as in --columns {example}."
+            )
         raise DataError(
             f"{place}, column '{text}': expected a unit out of {', '.join(quantity.powers)} for {column}, {found}; "
             f"state it, or what 1 in the column is, such as 0.5{quantity.unit}, in brackets: --columns {option}."
