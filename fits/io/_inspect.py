@@ -34,6 +34,8 @@ _LIKELY = {
     "displacement_um": r"[xyzdwh]\d*|ch2|ai\d*|.*(disp|pos|gauge|height|stroke|sensor|lvdt|interf|mirror|weg).*",
 }
 _MULTIPLES_OF_s = {"min": 60.0, "h": 3600.0}
+# Whole numbers of such a size, without a unit, are what a converter gives.
+_COUNTS = 10_000
 _READING = r".*(monitor|meas|readback).*"
 
 
@@ -151,11 +153,11 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
         if fit:
             best = max(fit, key=lambda name: _score(name, column))
             free.remove(best)
-            multiple = _MULTIPLES_OF_s.get(split_unit(best)[1] or "") if column == "time_s" else None
-            guessed[column] = Source(best, known_unit(best) or quantity.unit, scale=multiple or scale_of(best))
+            scale = _scale(column, best, found[best])
+            guessed[column] = Source(best, known_unit(best) or quantity.unit, scale=scale)
     moved, driven = guessed.get("displacement_um"), (known | guessed).get("voltage_V")
     if moved and driven and known_unit(moved.column) is None and moved.scale == 1:
-        volts = known_quantity("voltage_V").convert(np.ptp(found[driven.column]), driven.unit)
+        volts = known_quantity("voltage_V").convert(driven.scale * np.ptp(found[driven.column]), driven.unit)
         convert, stroke = known_quantity("displacement_um").convert, np.ptp(found[moved.column])
         strokes = {unit: convert(stroke, unit) for unit in ("um", "nm", "mm", "m")}
         unit = next((unit for unit, um in strokes.items() if likely_stroke(float(um / volts))), "um")
@@ -163,20 +165,27 @@ def _guessed(table: Table, found: dict[str, FloatArray], known: dict[str, Source
     return guessed
 
 
+def _scale(column: str, name: str, values: FloatArray) -> float:
+    """What 1 in a column is, in the unit of its name or else of the record; NaN where only who measured knows."""
+    multiple = _MULTIPLES_OF_s.get(split_unit(name)[1] or "") if column == "time_s" else None
+    whole = column != "time_s" and known_unit(name) is None and bool(np.all(values == np.rint(values)))
+    return math.nan if whole and np.abs(values).max() >= _COUNTS else multiple or scale_of(name)
+
+
 def _unknown_units(table: Table, found: dict[str, FloatArray], sources: dict[str, Source]) -> Iterator[str]:
-    """What has to be stated of columns in units that say nothing of V, um or s, such as % or counts."""
+    """What has to be stated of columns without a unit, or in one that says nothing of V, um or s, such as %."""
     for source in sources.values():
-        if math.isnan(source.scale):
+        name, unit = source.column, unscaled_unit(source.column)
+        example = f"write what 1 of it is in place of SCALE, as in [0.5 {source.unit}]"
+        if math.isnan(source.scale) and unit:
+            yield f"column '{name}' is in '{unit}': {example}"
+        elif math.isnan(source.scale):
+            yield f"column '{name}' states no unit, and is taken for counts, as its numbers are whole: {example}"
+        elif known_unit(name) is None and source.scale == 1:
             yield (
-                f"column '{source.column}' is in '{unscaled_unit(source.column)}': write what 1 of it is in place of "
-                f"SCALE, as in [0.5 {source.unit}]"
+                f"column '{name}' states no unit, and [{source.unit}] is guessed: correct it, or write what 1 of it "
+                f"is, as in [0.5{source.unit}]"
             )
-    moved = sources.get("displacement_um")
-    if moved is not None and split_unit(moved.column)[1] is None and moved.scale == 1:
-        yield (
-            f"column '{moved.column}' states no unit, and [{moved.unit}] is guessed from its size: correct it, or "
-            f"write what 1 of it is, as in [0.5{moved.unit}]"
-        )
     taken = {source.column for source in sources.values()}
     free = [name for name in found if name not in taken and np.ptp(found[name]) > 0]
     if free and "voltage_V" in sources and "displacement_um" not in sources:
