@@ -134,6 +134,21 @@ def test_the_option_that_a_refusal_suggests_can_be_pasted(tmp_path):
     np.testing.assert_allclose(found.displacement_um, signals()[2] / 1000)
 
 
+def test_the_refusal_of_a_column_without_a_unit_says_what_guesses_it(tmp_path):
+    """It said um where `inspect` said nm."""
+    path = tmp_path / "plain.csv"
+    path.write_text("time_s,voltage_V,y\n" + rows(*signals()[:2], 1000 * signals()[2]))
+    told = "for instance --columns 'displacement_um=y[UNIT]', or paste what microid inspect "
+    refused(run("fit", path, "--out", tmp_path / "m.json"), f"{told}{path} says")
+    named = ("--columns", "displacement_um=y[UNIT]")
+    refused(
+        run("fit", path, *named, "--out", tmp_path / "m.json"), "expected a unit out of um, nm", "found unit 'UNIT'"
+    )
+    command = shlex.split(json.loads(run("inspect", path, "--json").stdout)["command"])
+    found = read_table(path, columns=command[command.index("--columns") + 1])
+    np.testing.assert_allclose(found.displacement_um, signals()[2])
+
+
 def test_every_command_can_be_quiet_and_tell_more(good_csv):
     for name, command in commands():
         known = {spelt for option in options_of(command) for spelt in option.opts}

@@ -235,11 +235,11 @@ REFUSED = {
     "cut UTF-16": (csv_text().encode("utf-16")[:-1], 1, None, "UTF-16"),
     "no header": ("# a\n" + "\n".join(ROWS), 2, None, "header such as time_s,voltage_V,displacement_um"),
     "missing column": (csv_text("time_s,u1_V,displacement_um"), 1, "voltage_V", "--columns voltage_V=u1_V"),
-    "missing unit": (csv_text("time_s,voltage,displacement_um"), 1, "voltage_V", r"voltage_V=voltage\[V\]"),
+    "missing unit": (csv_text("time_s,voltage,displacement_um"), 1, "voltage_V", r"voltage_V=voltage\[UNIT\]"),
     "unknown unit": (csv_text("time_s,voltage_V,displacement_inch"), 1, "displacement_um", "'inch' .*um, nm, mm"),
     "unknown separator": (csv_text().replace(",", "&"), 1, "time_s", "separate the columns by commas"),
     "preamble": ("Model,TDS\n" + with_row(2, "x,y,3"), 3, "time_s", "put # before the line"),
-    "scope": (csv_text("TIME,CH1,CH2"), 1, "time_s", r"voltage_V=CH1\[V\],displacement_um=CH2\[um\]"),
+    "scope": (csv_text("TIME,CH1,CH2"), 1, "time_s", r"voltage_V=CH1\[UNIT\],displacement_um=CH2\[UNIT\]"),
     "two units": (with_column("voltage_mV", TIME), 1, "voltage_mV", "found also 'voltage_V'"),
     "duplicate": (with_column("voltage_V", TIME), 1, "voltage_V 4", "found also 'voltage_V'; choose one"),
     "text": (with_row(9, "3.5,oops,1"), 9, "voltage_V", "found 'oops'; correct the cell"),
@@ -304,7 +304,7 @@ BAD_MAPPINGS = [
     ({"voltage_V": "u1_V", "displacement_um": "height[ft]"}, "out of um, nm, mm, m, pm .*found unit 'ft'"),
     ({"voltage_V": "t_ms"}, "out of V, mV, uV, kV .*found unit 'ms'"),
     ({"volts": "u1_V"}, "'volts' is not a column of a record; name one of time_s, voltage_V"),
-    ({"time_s": "t_ms"}, r"column 'voltage_V'.*--columns 'voltage_V=u1_V,displacement_um=height\[um\]"),
+    ({"time_s": "t_ms"}, r"column 'voltage_V'.*--columns 'voltage_V=u1_V,displacement_um=height\[UNIT\]"),
 ]
 
 

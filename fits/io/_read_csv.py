@@ -161,7 +161,8 @@ class KnownColumns:
         interval_s = _interval_s(table, columns, sample_rate_Hz)
         needed = [name for name in required if name != "time_s" or interval_s is None]
         place = ", ".join(filter(None, (table.path, table.place())))
-        sources = find_sources(table.names, columns, needed, place)
+        file = os.fspath(path) if isinstance(path, str | os.PathLike) else ""
+        sources = find_sources(table.names, columns, needed, place, file)
         if interval_s is not None:
             sources.pop("time_s", None)
         if more is not None:

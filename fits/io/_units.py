@@ -130,11 +130,12 @@ def known_quantity(column: str) -> Quantity:
 
 
 def find_sources(
-    names: Sequence[str], columns: Mapping[str, str], required: Collection[str], place: str
+    names: Sequence[str], columns: Mapping[str, str], required: Collection[str], place: str, file: str = ""
 ) -> dict[str, Source]:
     """Choose the source column of every canonical column that the user's mapping or, failing that, the headers give.
 
-    A `DataError`, which begins with the place, refuses missing required columns, duplicates, and wrong units.
+    A `DataError`, which begins with the place, refuses missing required columns, duplicates, and wrong units; it
+    names the command that looks into the `file`, if there is one.
     """
     if "1" in columns:
         columns = _in_order(columns, names, required, place)
@@ -155,7 +156,7 @@ def find_sources(
         sources[column] = Source(name, found[1])
     missing = [column for column in required if column not in sources]
     if missing:
-        raise DataError(_missing(missing, names, sources, place))
+        raise DataError(_missing(missing, names, sources, place, file))
     return sources
 
 
@@ -222,7 +223,9 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
     return Source(text, str(unit), sign, scale)
 
 
-def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str) -> str:
+def _missing(
+    missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str, file: str
+) -> str:
     message = f"{place}, column '{missing[0]}': expected this column, found {_listed(names)}; "
     if len(names) == 1:
         return f"{message}separate the columns by commas, semicolons, tabs or spaces."
@@ -237,10 +240,14 @@ def _missing(missing: Sequence[str], names: Sequence[str], sources: Mapping[str,
         free = [name for name in free if name != near]  # a column serves once
         stem, unit = split_unit(near)
         known = unit in quantity.powers
-        guesses.append(f"{quantity.column}={Source(near, str(unit) if known else quantity.unit).spec()}")
+        # Of a unit that no name states only the numbers tell something, and those are not read yet.
+        stated = str(unit) if known else quantity.unit if unscaled_unit(near) else "UNIT"
+        guesses.append(f"{quantity.column}={Source(near, stated, scale=1.0 if known else scale_of(near)).spec()}")
         if unit and not known and stem.lower() in (quantity.stem, quantity.column.lower()):
             message += f"'{near}' has the unknown unit '{unit}' instead of one out of {', '.join(quantity.powers)}; "
     message += f"name what is missing, for instance --columns {shlex.quote(','.join(guesses))}"
+    if file and any(guess.endswith("[UNIT]") for guess in guesses):
+        message += f", or paste what microid inspect {shlex.quote(file)} says"
     if ", line " in place and not any(recognise(name) for name in names):
         message += ", or put # before this line if it is not the header"
     return f"{message}."
