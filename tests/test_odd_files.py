@@ -56,6 +56,7 @@ ODD = {
     "date beside": "Scope 3\n\n" + clocked("Date,Time,U [V],Position [um]\n", [f"2026-11-25,{at}" for at in DAY]),
     "names of two lines": '"Time\n(s)","Voltage\n(V)","Position\n(um)"\n' + rows(T, V, Y),
     "names with spaces": "Time (s)   Voltage (V)  Position (um)\n" + rows(T, V, Y, separator="   "),
+    "separator, lines above, units": "sep=;\nRig 3;;\nt;U;x\ns;V;um\n" + rows(T, V, Y, separator=";"),
     "minutes": "t [min],U [V],x [um]\n" + rows(T / 60, V, Y),
 }  # fmt: skip
 

@@ -71,19 +71,17 @@ def _beginnings(text: str) -> Iterator[int]:
 
 
 def _open_text(path: str, text: str) -> TextTable:
-    separator, lines = _first_lines(text)
+    declared, lines = _first_lines(text)
     if not lines:
         raise data_error(path, "expected a header and rows of numbers, found only comments; export again", "line 1")
     if lines[0][2].lstrip().startswith("{"):
         what = "expected a header and rows of numbers, found JSON; name a table (microid info shows a model file)"
         raise data_error(path, what, f"line {lines[0][0]}")
-    k, first, units = 0, 1, None
-    if not separator:
-        k, separator, first, units = _header(lines)
+    k, separator, first, units = _header(lines, declared)
     if first == k or _all_numbers(_names(lines[k][2], separator)):
         # A comment may be the header, if it states a unit.
         _, noted = _first_lines(text, comments=True)
-        at, mark, below, unit_line = _header(noted)
+        at, mark, below, unit_line = _header(noted, declared)
         if not any(map(known_unit, _names(noted[at][2], mark))) and unit_line is None:
             number, start, line = lines[k]
             numbered = tuple(str(i) for i in range(1, len(_names(line, separator)) + 1))
@@ -171,14 +169,16 @@ def _first_lines(text: str, comments: bool = False) -> tuple[str, list[_Line]]:
     return separator, lines
 
 
-def _header(lines: list[_Line]) -> tuple[int, str, int, int | None]:
+def _header(lines: list[_Line], declared: str) -> tuple[int, str, int, int | None]:
     """Which line is the header, what separates its cells, which is the first row, and which holds units, if any does.
+
+    A separator that the file has declared serves for all lines.
 
     It is the first line, unless rows of numbers are found below others that are no rows of theirs: then the first of
     the lines above them, of as many cells, that names a known quantity, or the last words above the units.
     """
     for i in range(len(lines)):
-        separator = _separator(lines[i][2])
+        separator = declared or _separator(lines[i][2])
         rows = [_names(line, separator) for _, _, line in lines[i : i + _ENOUGH]]
         if not all(len(row) == len(rows[0]) and any(row) and _all_numbers(row) for row in rows):
             continue
@@ -205,7 +205,7 @@ def _header(lines: list[_Line]) -> tuple[int, str, int, int | None]:
         # A row of which a cell is damaged is a row.
         damaged = [j for j in above if j > k and any(map(_is_number, above[j]))]
         return k, separator, min([*damaged, i]), next((each for each in units if each > k), None)
-    return 0, _separator(lines[0][2]), 1, None
+    return 0, declared or _separator(lines[0][2]), 1, None
 
 
 def _is_as_wide(line: str, separator: str, wide: int, width: int) -> bool:
