@@ -77,11 +77,16 @@ def known_unit(name: str) -> str | None:
     return unit if any(unit in quantity.powers for quantity in QUANTITIES) else None
 
 
+def is_unscaled(unit: str) -> bool:
+    """Whether a unit is one of those that say nothing of V, um or s."""
+    return unit.lower() in _UNSCALED
+
+
 def unscaled_unit(name: str) -> str | None:
     """The unit that a name ends in, such as `%` or counts, where only who measured knows what 1 of it is; or None."""
     unit = split_unit(name)[1]
     stated = unit is not None and known_unit(name) is None
-    return unit if stated and (str(unit).lower() in _UNSCALED or BRACKETS.fullmatch(name)) else None
+    return unit if stated and (is_unscaled(str(unit)) or BRACKETS.fullmatch(name)) else None
 
 
 def scale_of(name: str) -> float:

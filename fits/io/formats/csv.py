@@ -10,7 +10,7 @@ from fits.io._clock import is_clock
 from fits.io._read_file import numbered
 from fits.io._table import MOST_COLUMNS, Table, data_error, with_unit
 from fits.io._text_table import TextTable, looks_numeric, split_cells
-from fits.io._units import known_unit, recognise
+from fits.io._units import is_unscaled, known_quantity, known_unit, recognise
 from fits.io.formats._base import Format, register
 
 _EXCEL_SEPARATOR = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
@@ -197,7 +197,7 @@ def _header(lines: list[_Line], declared: str) -> tuple[int, str, int, int | Non
         if all(all(map(_is_number, cells)) for cells in above.values()):
             # Words beside the first rows of numbers, as in captures of Tektronix: there is no header.
             return min(above), separator, min(above), None
-        units = [k for k, cells in above.items() if 2 * sum(map(_is_unit, cells)) > len(cells)]
+        units = [k for k, cells in above.items() if _are_units(cells)]
         words = [k for k in above if k not in units]
         named = [k for k, cells in above.items() if any(map(recognise, cells))]
         over = [k for k in words if units and k < units[-1]]
@@ -232,8 +232,11 @@ def _separator(line: str) -> str:
     return next((mark for mark in "\t;|" if mark in unquoted), ",")
 
 
-def _is_unit(cell: str) -> bool:
-    return cell.strip(" []()") in ("", "-", "1", "%") or known_unit(f"x[{cell.strip(' []()')}]") is not None
+def _are_units(cells: list[str]) -> bool:
+    """Whether cells are units of columns: most of them known ones, or the first one of time, whatever the others."""
+    plain = [cell.strip(" []()") for cell in cells]
+    known = [cell in ("", "-", "1") or known_unit(f"x[{cell}]") or is_unscaled(cell) for cell in plain]
+    return 2 * sum(map(bool, known)) > len(cells) or known_unit(f"x[{plain[0]}]") in known_quantity("time_s").powers
 
 
 register(Format("a CSV file", (".csv", ".txt", ".dat", ".asc", ".tsv"), (), open_csv, several=True))
