@@ -6,7 +6,7 @@ import shlex
 import numpy as np
 import pytest
 from _command import refused, run
-from test_foreign_files import rows, signals
+from test_foreign_files import RATE_Hz, rows, signals
 
 import fits
 
@@ -72,3 +72,17 @@ def test_every_unit_that_is_guessed_is_told_of(tmp_path):
     assert [remark.partition(":")[0] for remark in told["remarks"] if "is guessed" in remark] == [
         f"column 'data_{k}' states no unit, and [{unit}] is guessed" for k, unit in ((1, "s"), (2, "V"), (3, "um"))
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "in_s"), [("t_min", "min", 60), ("Time [minutes]", "min", 60), ("t[h]", "h", 3600)]
+)
+def test_the_rate_of_times_in_minutes_and_hours_is_that_of_the_record(tmp_path, name, unit, in_s):
+    """The rate was stated for times in s."""
+    path = tmp_path / "minutes.csv"
+    path.write_text(f"{name},voltage_V,displacement_um\n" + rows(T / in_s, V, Y))
+    told = json.loads(run("inspect", path, "--json").stdout)
+    assert told["rate_Hz"] == pytest.approx(RATE_Hz)
+    assert told["channels"][0]["unit"] == unit
+    np.testing.assert_allclose(fits.read_table(path, {"time_s": f"{name}[{in_s}s]"}).time_s, T, rtol=0, atol=1e-12)
+    assert f"time_s={name}[{in_s}s]" in told["command"]

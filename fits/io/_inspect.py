@@ -98,7 +98,8 @@ def inspect_table(path: AnyPath) -> Inspection:
     sources = known | _guessed(table, found, known)
     interval_s, even = table.interval_s, table.interval_s is not None
     if "time_s" in sources:
-        steps_s = np.diff(known_quantity("time_s").convert(found[sources["time_s"].column], sources["time_s"].unit))
+        timed = sources["time_s"]
+        steps_s = np.diff(known_quantity("time_s").convert(timed.scale * found[timed.column], timed.unit))
         if len(steps_s):
             interval_s = float(np.median(steps_s))
             even = bool(np.ptp(steps_s) < 0.01 * interval_s)
@@ -109,6 +110,8 @@ def inspect_table(path: AnyPath) -> Inspection:
         low, high = (None, None) if values is None else (float(values.min()), float(values.max()))
         problem = ", ".join(problems[name][::-1]) if name in problems else ""
         unit = known_unit(name) or unscaled_unit(name)
+        if use == "time_s" and sources[use].scale > 1:
+            unit = split_unit(name)[1]
         channels.append(Channel(k, name, unit, low, high, use, bool(use) and use not in known, problem))
     pairs = [
         f"{column}={_spec(table, source)}"

@@ -14,6 +14,7 @@ LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
 VOLTAGE = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
 # Words for units, as programs of measurement have them.
 _WORDS = {"second": "s", "sec": "s", "millisecond": "ms", "msec": "ms", "microsecond": "us"}
+_WORDS |= {"minute": "min", "hour": "h"}
 _WORDS |= {"volt": "V", "millivolt": "mV", "kilovolt": "kV", "kelvin": "K", "celsius": "degC"}
 _WORDS |= {"meter": "m", "millimeter": "mm", "micrometer": "um", "micron": "um", "nanometer": "nm"}
 _WORDS |= {"metre": "m", "millimetre": "mm", "micrometre": "um", "nanometre": "nm"}
