@@ -120,5 +120,28 @@ def test_a_sensor_at_its_end_is_noticed(tmp_path):
 
 
 def test_a_column_in_a_unit_of_another_quantity_is_not_proposed():
-    with pytest.raises(DataError, match=r"'time_s': 't\[s\]', 'voltage_V': 'Vcmd\[V\]', 'disp"):
+    with pytest.raises(DataError, match=r"'time_s': 't\[UNIT\]', 'voltage_V': 'Vcmd\[UNIT\]', 'disp"):
         read_table({"t": np.arange(9.0), "Vcmd": np.arange(9.0), "gauge_um": np.arange(9.0)})
+
+
+def test_a_rate_beside_a_column_of_times_at_another_is_remarked_on(tmp_path):
+    time_s, voltage_V = sine()
+    warned(tmp_path, time_s, voltage_V, 0.2 * voltage_V)
+    found = read_csv(tmp_path / "a.csv", sample_rate_Hz=50.0)
+    np.testing.assert_array_equal(found.time_s, np.arange(len(time_s)) / 50)
+    (sentence,) = found.warnings
+    assert "a.csv, column 'time_s': it holds times at 100 Hz, and --sample-rate 50 was taken instead" in sentence
+    assert read_csv(tmp_path / "a.csv", sample_rate_Hz=100.0).warnings == ()
+
+
+def test_numbers_that_name_the_time_too_are_counted_with_it(tmp_path):
+    """Two numbers, meant as time and voltage, were taken for voltage and displacement."""
+    time_s, voltage_V = sine()
+    warned(tmp_path, time_s, voltage_V, 0.2 * voltage_V)
+    words = "expected by --columns 3 numbers, for time_s, voltage_V, displacement_um, found 2; give one for each"
+    with pytest.raises(DataError, match=words):
+        read_csv(tmp_path / "a.csv", "1,2")
+    np.testing.assert_array_equal(read_csv(tmp_path / "a.csv", "1,2", ("time_s", "voltage_V")).voltage_V, voltage_V)
+    np.testing.assert_array_equal(read_csv(tmp_path / "a.csv", "2,-3").displacement_um, -0.2 * voltage_V)
+    with pytest.raises(DataError, match=r"found unit 's'.*'voltage_V=time_s\[SCALE V\]'"):
+        read_csv(tmp_path / "a.csv", {"voltage_V": "time_s"})

@@ -163,8 +163,7 @@ class KnownColumns:
         place = ", ".join(filter(None, (table.path, table.place())))
         file = os.fspath(path) if isinstance(path, str | os.PathLike) else ""
         sources = find_sources(table.names, columns, needed, place, file)
-        if interval_s is not None:
-            sources.pop("time_s", None)
+        unused = sources.pop("time_s", None) if interval_s is not None else None
         if more is not None:
             sources = {name: sources[name] for name in (*required, *more) if name in sources}
         strict = {source.column for source in sources.values()}
@@ -188,6 +187,8 @@ class KnownColumns:
             # A quotient by a whole rate is rounded once, as those are that a file would have.
             rate_Hz = sample_rate_Hz or round(1 / interval_s) or 1
             arrays["time_s"] = count / rate_Hz if 1 / rate_Hz == interval_s else count * interval_s
+            if unused is not None and unused.column in found:
+                left_out += _other_rate(table, unused, found[unused.column], rate_Hz)
         return cls(table, sources, arrays, found, problems, left_out)
 
     def place(self, column: str, row: int | None = None) -> str:
@@ -320,6 +321,16 @@ def _interval_s(table: Table, columns: Mapping[str, str], rate_Hz: float | None)
         return 1 / rate_Hz
     known = (found[0].column for found in map(recognise, table.names) if found)
     return None if "time_s" in columns or "time_s" in known else table.interval_s
+
+
+def _other_rate(table: Table, source: Source, times: FloatArray, rate_Hz: float) -> tuple[str, ...]:
+    """A remark where a column of times, shape (n,), has another rate than the one that is taken in its place."""
+    steps_s = np.diff(known_quantity("time_s").convert(times, source.unit))
+    median_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    if median_s <= 0 or abs(median_s * rate_Hz - 1) < 0.01:
+        return ()
+    words = f"it holds times at {1 / median_s:.6g} Hz, and --sample-rate {rate_Hz:g} was taken instead"
+    return (f"{table.path}, column '{source.column}': {words}; leave that out if the column is right.",)
 
 
 def _reversals(values: FloatArray) -> FloatArray:
