@@ -168,10 +168,14 @@ def find_sources(
 def _in_order(
     columns: Mapping[str, str], names: Sequence[str], required: Collection[str], place: str
 ) -> dict[str, str]:
-    """Numbers alone, given to the required columns in their order; the time may have been found by its header."""
+    """Numbers alone, given to the required columns in their order; the time may have been found by its header.
+
+    Where a number is that of this time, there has to be one for each.
+    """
     order = list(required)
-    timed = any(found[0].column == "time_s" for found in map(recognise, names) if found)
-    if "time_s" in order and timed and len(columns) < len(order):
+    times = {str(k) for k, found in enumerate(map(recognise, names), 1) if found and found[0].column == "time_s"}
+    named = {number.lstrip("-").partition("[")[0].strip() for number in columns.values()}
+    if "time_s" in order and times and not times & named and len(columns) < len(order):
         order.remove("time_s")
     if len(columns) != len(order):
         more = "" if "time_s" not in order else ", or state --sample-rate where no column holds the time"
@@ -214,7 +218,8 @@ def _mapped(column: str, text: str, names: Sequence[str], place: str) -> Source:
         found = f"found unit '{unit}'" if unit else "found no unit"
         if scaled and scale != 1:
             found = f"found {scaled[0]} for 1 in the column"
-        option = shlex.quote(f"{column}={Source(text, quantity.unit, scale=scale_of(text)).spec()}")
+        stated_too = math.nan if known_unit(text) else scale_of(text)
+        option = shlex.quote(f"{column}={Source(text, quantity.unit, scale=stated_too).spec()}")
         if unit and unit.startswith(_UNKNOWN):
             example = shlex.quote(f"{column}={text}[0.5 {quantity.unit}]")
             raise DataError(
