@@ -169,6 +169,16 @@ def test_a_file_of_another_kind_is_told_by_what_it_is(tmp_path, good_csv):
     refused(
         run("inspect", model), "line 1: expected a header and rows of numbers, found JSON; name a table (microid info"
     )
+    table = "expected a model file in JSON, found a table or another text; name such a file (microid inspect shows"
+    refused(run("info", good_csv), table)
+    bare = tmp_path / "bare.csv"
+    bare.write_text("0.5,1,2\n1.5,2,3\n")
+    refused(run("info", bare), table)
+    large = tmp_path / "large.json"
+    large.write_text(model.read_text() + " " * 1_000_000)
+    for file in (model, large):
+        for command in (("sweep", file, "--out", tmp_path / "out"), ("sensitivity", file)):
+            refused(run(*command), "found JSON; name another file (microid info shows a model file)")
     answer.write_text('{"schema": "microid.diagnosis/1"}')
     refused(run("info", answer), "found the answer of a diagnosis; name baseline.json or extended.json beside it")
 

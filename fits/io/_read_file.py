@@ -54,8 +54,15 @@ def read_bytes(path: AnyPath, what: str, most: int) -> bytes:
 
 
 def read_text(path: AnyPath, what: str, most: int) -> str:
-    """Read a file of UTF-8 text, with or without a byte-order mark; arguments and errors as of `read_bytes`."""
-    data = read_bytes(path, what, most)
+    """Read a file of UTF-8 text, with or without a byte-order mark; arguments and errors as of `read_bytes`.
+
+    JSON in place of TOML is refused as such, however large it is.
+    """
+    data = read_bytes(path, what, max(most, MOST_JSON_BYTES))
+    if most == MOST_TOML_BYTES and data.lstrip().startswith(b"{"):
+        found = "found JSON; name another file (microid info shows a model file)"
+        raise DataError(f"{os.fspath(path)}: expected {what}, {found}.")
+    refuse_large(os.fspath(path), len(data), most)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -92,6 +99,9 @@ def parse_json(text: str, place: str, what: str) -> Any:
     try:
         found = json.loads(text, object_pairs_hook=once, parse_constant=refuse)
     except (ValueError, RecursionError) as error:
+        if text.strip() and not text.lstrip().startswith(("{", "[")):
+            found = "found a table or another text; name such a file (microid inspect shows a table)"
+            raise DataError(f"{place}: expected {what} in JSON, {found}.") from None
         raise DataError(
             f"{place}: expected {what} in JSON, found a broken or cut one ({_why(error)}); restore the file, or have "
             "it written again."
@@ -115,7 +125,7 @@ def _why(error: ValueError | RecursionError) -> str:
     if isinstance(error, RecursionError):
         return f"more than {MOST_DEPTH} nested levels"
     if isinstance(error, json.JSONDecodeError):
-        begins = "it begins with something else" if error.msg == "Expecting value" else error.msg
+        begins = "it is empty" if error.msg == "Expecting value" else error.msg
         return f"{error.msg}, line {error.lineno}" if error.pos else begins
     # All else comes from Python's `int`, and is for programmers.
     toml = isinstance(error, tomllib.TOMLDecodeError)
