@@ -140,7 +140,7 @@ def test_info_does_not_wait_for_jax(bench):
 def test_what_cannot_be_read_is_refused_without_jax(command, tmp_path):
     bad = tmp_path / "bad.csv"
     bad.write_text("time_s,voltage_V,displacement_um\n0,1,2\n1,x,y\n")
-    done = without_jax(*command, bad, "--out", tmp_path / "out.json")
+    done = without_jax(*command, bad, "--out", tmp_path / "out")
     assert done.returncode == 2
     column = "displacement_um" if command[0] == "compensate" else "voltage_V"
     assert f"bad.csv, line 3, column '{column}'" in done.stderr
@@ -179,6 +179,8 @@ def test_simulate_refuses_what_it_cannot_predict(bench, tmp_path):
     refused(run("simulate", model, tmp_path / "none.csv", "--out", out), "none.csv")
     refused(run("simulate", model, program, "--out", tmp_path / "none" / "p.csv"), "none")
     refused(run("simulate", model, program, "--out", program), "overwrite")
+    for name in ("p.xlsx", "p.xlsx.gz", "p.npz.gz", "p.json"):
+        refused(run("simulate", model, program, "--out", tmp_path / name), f"{name}: expected a name that ends in")
     refused(run("simulate", program, program, "--out", out), "program.csv")
     text = model.read_text()
     for changed in (text.replace("microid.model/1", "microid.model/2"), text.replace("0.", "1.", 1), text[:1000]):

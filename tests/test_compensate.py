@@ -70,7 +70,14 @@ def test_refusals_name_sample_range_cause_and_remedy(rng):
     wanted_um[[70, 90]] = highest_um + 0.5, lowest_um - 0.5
     with pytest.raises(DataError) as refusal:
         compensate(model, reference(wanted_um))
-    for words in ("wanted.csv", "sample 71", "0.7 s", f"{lowest_um:.6g} to {highest_um:.6g} um", "fitted", "clipped"):
+    for words in (
+        "wanted.csv",
+        "sample 71",
+        "0.7 s",
+        f"{lowest_um:.6g} to {highest_um:.6g} um",
+        "fitted",
+        "(clip=True)",
+    ):
         assert words in str(refusal.value)
     assert f"2 of {SAMPLES} samples" in str(refusal.value)
     assert np.flatnonzero(compensate(model, reference(wanted_um), clip=True).clipped).tolist() == [70, 90]
@@ -154,7 +161,7 @@ def test_the_command_writes_a_voltage_and_a_plot(rng, model_file, tmp_path):
     whole_picture(tmp_path / "plots" / "compensation.png")
 
     csv.write_text(f"time_s,displacement_um\n0,{lowest_um}\n1,{highest_um + 1}\n")
-    refused(run("compensate", path, csv, "--out", tmp_path / "w.csv"), "r.csv", "sample 2", "clipped")
+    refused(run("compensate", path, csv, "--out", tmp_path / "w.csv"), "r.csv", "sample 2", "clipped", "(--clip)")
     lower_V, upper_V = limits_V(model)
     high_V = 0.3 * lower_V + 0.7 * upper_V
     clipped = run("compensate", path, csv, "--out", out, "--clip", f"--limits={lower_V},{high_V}", "--json")
@@ -172,12 +179,16 @@ def test_the_command_refuses_in_one_sentence(model_file, tmp_path):
     before = files(tmp_path)
     refused(run("compensate", path, csv, "--out", out, "--dynamic"), "m.json", "mechanics", "--dynamic")
     refused(run("compensate", path, csv, "--out", csv), "overwrite")
+    refused(run("compensate", path, csv, "--out", tmp_path / "v.xlsx"), "v.xlsx: expected a name that ends in .csv")
+    refused(run("control", path, csv, "--out", tmp_path / "v.mat"), "v.mat: expected a name that ends in .csv")
     refused(run("compensate", path, csv, "--out", out, "--limits", "ten,20"), "--limits", "ten,20")
     refused(run("compensate", path, csv, "--out", out, "--limits", "90,20"), "--limits", "90,20")
     refused(run("compensate", path, tmp_path / "none.csv", "--out", out), "none.csv")
     refused(run("compensate", csv, csv, "--out", out), "r.csv")
     assert files(tmp_path) == before
     assert run("compensate", path, csv, "--out", out, "--static").exit_code == 0
+    assert run("compensate", path, csv, "--out", tmp_path / "v.npz").exit_code == 0
+    assert np.load(tmp_path / "v.npz")["voltage_V"].tolist() == [read(out)[1][1][0]]
 
 
 def test_a_reference_at_rest_can_be_drawn(rng, tmp_path):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fits.control._tune_problem import Goal, passed_limits
     from fits.diagnosis._diagnose import diagnose
     from fits.diagnosis._result import Diagnosis, Step
-    from fits.io._atomic import finite_json, refuse_nonfinite, write_csv, write_table
+    from fits.io._atomic import check_table_name, finite_json, refuse_nonfinite, write_csv, write_table
     from fits.io._inspect import inspect_table
     from fits.io._jax_setup import start_jax
     from fits.io._json import strict

@@ -63,7 +63,8 @@ def columns(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def out_csv(metavar: str) -> Callable[[Any], Any]:
-    return click.option("--out", required=True, metavar=metavar, help="CSV to write; .gz is compressed.")
+    words = "Table to write: CSV, which .gz compresses, or what a name that ends in .npz or .parquet says."
+    return click.option("--out", required=True, metavar=metavar, help=words)
 
 
 def plots(what: str) -> Callable[[Any], Any]:

@@ -37,6 +37,7 @@ def compensate(given: common.Given) -> None:
     """
     import numpy as np
 
+    late.check_table_name(given.out)
     common.refuse_overwriting(given.out, [given.model, given.reference])
     volts, stated = common.parse_rig_limits(given.limits, given.limit, given.margin)
     wanted = late.read_reference(given.reference, **common.reading(given))
@@ -52,7 +53,10 @@ def compensate(given: common.Given) -> None:
         unfinished, drawings = made.file(given.out), made.folder(given.plots)
         asked = stage, wanted, given.initial, given.clip, volts
         plain = isinstance(stage, late.PlainModel)
-        found = late.compensate_plain(*asked) if plain else late.compensate(*asked, given.way)
+        try:
+            found = late.compensate_plain(*asked) if plain else late.compensate(*asked, given.way)
+        except DataError as error:
+            raise DataError(str(error).replace("clip=True", "--clip"), of_model=error.of_model) from error
         program = late.Record(wanted.time_s, found.voltage_V, None, source=wanted.source)
         if plain:
             predicted = stage.ranges(program, found.displacement_um, given.initial)
@@ -67,7 +71,7 @@ def compensate(given: common.Given) -> None:
         same: dict[str, Any] = {"initial": given.initial, "form": given.form}
         drawn = [] if drawings is None else late.plot_compensation(*to_draw, drawings, **same)
         table = {"time_s": wanted.time_s, "voltage_V": found.voltage_V, "displacement_um": found.displacement_um}
-        late.write_csv(unfinished, table)
+        late.write_table(unfinished, table)
     off = np.abs(found.displacement_um - found.reference_um)
     places = common.paths_in(given.plots, drawn)
     remarks = [*wanted.warnings, *found.remarks, *said]

@@ -103,6 +103,7 @@ def control(given: common.Given) -> None:
         if step is not None and not _FINEST <= step <= _LARGEST:
             steps = f"{_FINEST:g} to {_LARGEST:g}, found {step:g}"
             raise DataError(f"{_option(name)}: expected {steps}; leave it out for none.")
+    late.check_table_name(given.out)
     stated = {_option(name): getattr(given, name) for name in _LIMITS}
     volts, allowed_here = common.parse_rig_limits(given.limits, given.limit, given.margin)
     wanted = late.read_reference(given.reference, **common.reading(given))
@@ -166,7 +167,7 @@ def control(given: common.Given) -> None:
         more = [*made.remarks, *said, *_judged(passed, stated, given.controller, known_gains is not None)]
         names = ("time_s", "reference_um", "displacement_um", "measured_um", "command_V", "error_um")
         table = {name: np.asarray(getattr(run, name)) for name in names}
-        late.write_csv(unfinished, table | {"time_s": wanted.time_s})
+        late.write_table(unfinished, table | {"time_s": wanted.time_s})
         to_draw = run, made.controller, loop.plants
         how: dict[str, Any] = {"delay": given.delay, "goal": goal, "form": given.form}
         drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, **how)

@@ -21,11 +21,12 @@ def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.
 
     PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
-    displacement_sd_um; sensor noise is not in the last. A name that ends in .npz or .parquet says that format.
+    displacement_sd_um; sensor noise is not in the last.
     """
     import numpy as np
 
     progress = common.now_and_then(common.progress_to_stderr(given.quiet))
+    late.check_table_name(given.out)
     common.refuse_overwriting(given.out, [given.model, given.program])
     check_file(given.out)
     record = late.read_table(given.program, required=("time_s", "voltage_V"), **common.reading(given))

@@ -131,7 +131,7 @@ def _led(
         raise DataError(
             f"{reference.source}: sample {k + 1} (time {reference.time_s[k]:g} s) needs a command of "
             f"{asked_V[k]:.6g} V to make up for the driver's lag, but {bind}; slow the reference down, keep it away "
-            "from the ends of the range, or have it clipped to the nearest that can be reached."
+            "from the ends of the range, or have it clipped to the nearest that can be reached (clip=True)."
         )
     cut = excess_V > _SHOWS * width_V
     said = f"the command was cut to the limits at {int(cut.sum())} of its samples, by at most {excess_V.max():.3g} V."

@@ -73,7 +73,7 @@ def follow(
             f"{lowest[k]:.6g} to {highest[k]:.6g} um can be reached there, sensor offset included, because "
             f"{binding(law, limits)}; {int(clipped.sum())} of {len(wanted)} samples are out of reach: shift or "
             f"shrink the reference,{' slow it down,' if doubt else ''} "
-            "or have it clipped to the nearest that can be reached."
+            "or have it clipped to the nearest that can be reached (clip=True)."
         )
     return voltage, clipped
 

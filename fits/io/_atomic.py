@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,8 @@ from fits.io._errors import AnyPath, DataError
 from fits.io._extras import need
 from fits.io._file_set import file_set
 
+# How names of the tables end that are written.
+_TEXTS, _ARRAYS = ("", ".csv", ".txt", ".dat"), (".npz", ".parquet")
 # Rows of a text that are made at a time.
 _ROWS = 65_536
 
@@ -76,13 +79,24 @@ def write_csv(path: AnyPath, columns: Mapping[str, NDArray[Any]], comments: Sequ
                 writer.writerows(zip(*lists, strict=True))  # csv writes floats by repr, which is exact
 
 
+def check_table_name(path: AnyPath) -> None:
+    """Refuse, in a `DataError`, a name that ends as that of a table which `write_table` does not write."""
+    name = Path(path).name.lower()
+    suffix = Path(name.removesuffix(".gz")).suffix
+    if suffix not in (_TEXTS if name.endswith(".gz") else _TEXTS + _ARRAYS):
+        raise DataError(
+            f"{os.fspath(path)}: expected a name that ends in .csv, .csv.gz, .txt, .dat, .npz or .parquet, found one "
+            "in another format; choose one of these."
+        )
+
+
 def write_table(path: AnyPath, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write columns, shape `(n,)` each, in the format of the name: `.npz`, `.parquet`, or else CSV.
 
     A `DataError` refuses values that are not finite, and a format whose package is not installed.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in (".npz", ".parquet"):
+    if suffix not in _ARRAYS:
         write_csv(path, columns)
         return
     for name, values in columns.items():
