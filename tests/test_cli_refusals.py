@@ -138,7 +138,7 @@ def test_the_refusal_of_a_column_without_a_unit_says_what_guesses_it(tmp_path):
     """It said um where `inspect` said nm."""
     path = tmp_path / "plain.csv"
     path.write_text("time_s,voltage_V,y\n" + rows(*signals()[:2], 1000 * signals()[2]))
-    told = "for instance --columns 'displacement_um=y[UNIT]', or paste what microid inspect "
+    told = "for instance --columns 'displacement_um=y[UNIT]', or see what microid inspect "
     refused(run("fit", path, "--out", tmp_path / "m.json"), f"{told}{path} says")
     named = ("--columns", "displacement_um=y[UNIT]")
     refused(

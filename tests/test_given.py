@@ -96,19 +96,20 @@ def turned(frame):
 @pytest.mark.parametrize(
     ("frame", "words"),
     [
-        (FRAME.rename(columns={"voltage_V": "drive"}), r"fits\.read_table\(data, {'voltage_V': 'drive\[V\]'}\)"),
-        (FRAME.rename(columns={"displacement_um": "displacement"}), "{'displacement_um': 'displacement\\[um\\]'}"),
+        (FRAME.rename(columns={"voltage_V": "drive"}), r"fits\.read_table\(data, {'voltage_V': 'drive\[UNIT\]'}\)"),
+        (FRAME.rename(columns={"displacement_um": "displacement"}), "{'displacement_um': 'displacement\\[UNIT\\]'}"),
         (FRAME.assign(voltage_V=np.nan), r'with fits\.read_table\(data, missing="drop"\)'),
     ],
 )
 def test_refusals_of_a_frame_say_what_to_write_in_python(frame, words):
-    """And what they say works."""
+    """And what they say works, once the unit stands there."""
     for entry in (fits.read_table, fits.fit):
         with pytest.raises(fits.DataError, match=words) as caught:
             entry(frame)
         assert "--" not in str(caught.value)
     if said := re.search(r"read_table\(data, ({.*?})\)", str(caught.value)):
-        np.testing.assert_array_equal(fits.read_table(frame, ast.literal_eval(said[1])).voltage_V, VOLTAGE_V)
+        stated = ast.literal_eval(said[1].replace("UNIT", "V" if "drive" in frame else "um"))
+        np.testing.assert_array_equal(fits.read_table(frame, stated).voltage_V, VOLTAGE_V)
 
 
 def test_warnings_of_a_frame_say_what_to_write_in_python(tmp_path):
@@ -122,7 +123,7 @@ def test_warnings_of_a_frame_say_what_to_write_in_python(tmp_path):
     assert again.warnings[0] == warning.replace(call, "fits.read_runs(data, {'displacement_um': '-displacement_um'})")
     FRAME.rename(columns={"voltage_V": "drive"}).to_csv(tmp_path / "other.csv", index=False)
     for entry in (fits.read_table, fits.fit):
-        with pytest.raises(fits.DataError, match=r"other\.csv', {'voltage_V': 'drive\[V\]'}\)"):
+        with pytest.raises(fits.DataError, match=r"other\.csv', {'voltage_V': 'drive\[UNIT\]'}\)"):
             entry(tmp_path / "other.csv")
 
 
@@ -204,6 +205,15 @@ def test_a_record_says_what_it_holds_and_is_drawn():
 def test_what_holds_no_numbers_is_no_record():
     with pytest.raises(fits.DataError, match="voltage_V: expected an array of numbers, found something else"):
         record(voltage_V=["high"] * 300)
+    for complex_V in (1j * VOLTAGE_V, list(1j * VOLTAGE_V), VOLTAGE_V + 0j):
+        with pytest.raises(fits.DataError, match="voltage_V: expected real numbers, found complex ones"):
+            record(voltage_V=complex_V)
+
+
+def test_one_column_is_no_run():
+    for column, name in ((pd.Series(VOLTAGE_V), "Series"), (VOLTAGE_V, "ndarray")):
+        with pytest.raises(fits.DataError, match=f"mapping of arrays, found {name}; give one of these, such as"):
+            fits.fit(column)
 
 
 def test_a_program_without_samples_is_refused():

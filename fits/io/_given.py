@@ -22,8 +22,8 @@ def records_given(given: AnyRuns, what: str = "run") -> tuple[Record, ...]:
 
     A `DataError` says which cannot be read, has no samples, or was only commanded.
     """
-    # Tables of pandas and of xarray are iterables of their columns.
-    is_table = hasattr(given, "columns") or hasattr(given, "to_dataframe")
+    # Tables of pandas and of xarray are iterables of their columns, and one column is one of numbers.
+    is_table = hasattr(given, "columns") or hasattr(given, "to_dataframe") or hasattr(given, "dtype")
     is_one = is_table or isinstance(given, Record | str | os.PathLike | Mapping) or not isinstance(given, Iterable)
     each: Iterable[Any] = (given,) if is_one else given
     read = (one if isinstance(one, Record) else read_table(one) for one in each)

@@ -17,7 +17,12 @@ from fits.io._summary import AbstractSummary
 def read_only(name: str, values: ArrayLike) -> FloatArray:
     """Numbers that nobody can change, of any shape; a `DataError` refuses what is none."""
     try:
-        array = np.asarray(values, dtype=np.float64)
+        found = np.asarray(values)
+        if found.dtype.kind == "c":
+            raise DataError(f"{name}: expected real numbers, found complex ones; give the real part if it is meant")
+        array = np.asarray(found, dtype=np.float64)
+    except DataError:
+        raise
     except (TypeError, ValueError):
         raise DataError(f"{name}: expected an array of numbers, found something else; give numbers alone") from None
     if array.flags.writeable:

@@ -257,7 +257,7 @@ def _missing(
             message += f"'{near}' has the unknown unit '{unit}' instead of one out of {', '.join(quantity.powers)}; "
     message += f"name what is missing, for instance --columns {shlex.quote(','.join(guesses))}"
     if file and any(guess.endswith("[UNIT]") for guess in guesses):
-        message += f", or paste what microid inspect {shlex.quote(file)} says"
+        message += f", or see what microid inspect {shlex.quote(file)} says"
     if ", line " in place and not any(recognise(name) for name in names):
         message += ", or put # before this line if it is not the header"
     return f"{message}."
