@@ -209,6 +209,11 @@ def test_synth_refuses_unknown_scenarios_and_places(tmp_path):
     listed = run("synth", "--list")
     assert listed.exit_code == 0
     assert {"quickstart", "plays"} <= {line.split()[0] for line in listed.stdout.splitlines()}
+    for arguments in (("--list", "--json"), ("--json", "--list")):
+        about = json.loads(run("synth", *arguments).stdout)
+        assert [f"{name:20} {words}" for name, words in about.items()] == listed.stdout.splitlines()
+    for arguments in ((), ("plays",), ("--out", tmp_path / "q")):
+        refused(run("synth", *arguments), "expected a SCENARIO and --out DIR; --list shows the scenarios")
     seeded = json.loads(run("synth", "plays", "--out", tmp_path / "q", "--seed", 3, "--json").stdout)
     assert seeded["seed"] == 3
     assert sorted(seeded["files"]) == [

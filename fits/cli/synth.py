@@ -8,19 +8,9 @@ from fits.io._errors import DataError
 from fits.io._file_set import file_set
 
 
-def _list(context: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted and not context.resilient_parsing:
-        import data_synth
-
-        for name in data_synth.scenario_names():
-            click.echo(f"{name:20} {data_synth.load_scenario(name).description}")
-        click.echo(f"{data_synth.BOUCWEN:20} The Bouc-Wen benchmark: a noisy multisine, and two tests without noise.")
-        context.exit()
-
-
 @click.command()
-@click.argument("scenario")
-@options.out_folder
+@click.argument("scenario", required=False)
+@click.option("--out", metavar="DIR", help="Folder to write to; it is made if need be. Needed, except to list.")
 @click.option(
     "--seed", type=click.IntRange(0, 2**64 - 1), help="Seed; the scenario's own by default, and 0 for boucwen."
 )
@@ -29,9 +19,7 @@ def _list(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     type=click.IntRange(100),
     help="First samples that are kept of each record of boucwen; all by default, which takes some 40 s.",
 )
-@click.option(
-    "--list", is_flag=True, expose_value=False, is_eager=True, callback=_list, help="List the scenarios and exit."
-)
+@click.option("--list", "listed", is_flag=True, help="List the scenarios, and write nothing.")
 @options.json_output
 @common.in_sentences
 def synth(given: common.Given) -> None:
@@ -41,6 +29,13 @@ def synth(given: common.Given) -> None:
     """
     import data_synth
 
+    if given.listed:
+        about = {name: data_synth.load_scenario(name).description for name in data_synth.scenario_names()}
+        about[data_synth.BOUCWEN] = "The Bouc-Wen benchmark: a noisy multisine, and two tests without noise."
+        common.print_result(given, about, [f"{name:20} {words}" for name, words in about.items()])
+        return
+    if given.scenario is None or given.out is None:
+        raise DataError("synth: expected a SCENARIO and --out DIR; --list shows the scenarios.")
     with file_set() as made:
         folder = made.folder(given.out)
         if given.scenario == data_synth.BOUCWEN:
