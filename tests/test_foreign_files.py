@@ -236,6 +236,12 @@ def test_further_formats(tmp_path, name):
     assert_same(fits.read_table(tmp_path / name, parse_columns(named)))
 
 
+def test_a_comment_that_ends_in_a_unit_is_no_header(tmp_path):
+    path = tmp_path / "comment.csv"
+    path.write_text("# one sample per 2 ms\n" + TABLE)
+    assert_same(fits.read_table(path, parse_columns("1,2,3")))
+
+
 def test_several_tables_in_a_labview_file_are_told_apart(tmp_path):
     path = tmp_path / "two.lvm"
     t, v, y = signals()

@@ -57,6 +57,9 @@ ODD = {
     "names of two lines": '"Time\n(s)","Voltage\n(V)","Position\n(um)"\n' + rows(T, V, Y),
     "names with spaces": "Time (s)   Voltage (V)  Position (um)\n" + rows(T, V, Y, separator="   "),
     "separator, lines above, units": "sep=;\nRig 3;;\nt;U;x\ns;V;um\n" + rows(T, V, Y, separator=";"),
+    "units behind a slash": "Zeit/ms;Spannung / mV;Weg/µm\n" + rows(1e3 * T, 1e3 * V, Y, separator=";"),
+    "units behind a blank": "Time ms,Piezo V,Pos um\n" + rows(1e3 * T, V, Y),
+    "quantities and units behind a slash": "Time/s,Voltage/V,Displacement/Micrometers\n" + rows(T, V, Y),
     "minutes": "t [min],U [V],x [um]\n" + rows(T / 60, V, Y),
 }  # fmt: skip
 

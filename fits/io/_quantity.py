@@ -12,6 +12,7 @@ FloatArray = NDArray[np.float64]
 
 LENGTH = {"um": 0, "nm": -3, "mm": 3, "m": 6, "pm": -6}
 VOLTAGE = {"V": 0, "mV": -3, "uV": -6, "kV": 3}
+TIME = {"s": 0, "ms": -3, "us": -6, "ns": -9}
 # Words for units, as programs of measurement have them.
 _WORDS = {"second": "s", "sec": "s", "millisecond": "ms", "msec": "ms", "microsecond": "us"}
 _WORDS |= {"minute": "min", "hour": "h"}
@@ -19,6 +20,9 @@ _WORDS |= {"volt": "V", "millivolt": "mV", "kilovolt": "kV", "kelvin": "K", "cel
 _WORDS |= {"meter": "m", "millimeter": "mm", "micrometer": "um", "micron": "um", "nanometer": "nm"}
 _WORDS |= {"metre": "m", "millimetre": "mm", "micrometre": "um", "nanometre": "nm"}
 _PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs, and the degree sign
+# What is a unit behind a blank or a slash, too, where much else may stand.
+_PLAIN = {*LENGTH, *VOLTAGE, *TIME, "min", "h", "%"}
+_LAST = re.compile(r"(?P<stem>.*\S)(?:\s+|\s*/\s*)(?P<unit>[^\s/]+)")
 BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
 
 
@@ -50,13 +54,20 @@ class Quantity:
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Split ``height_nm``, ``height[nm]`` or ``height (nm)`` into stem and unit; None where there is no unit."""
-    match = BRACKETS.fullmatch(name)
-    if match:
-        stem, unit = match["stem"], match["unit"]
-    else:
-        stem, _, unit = name.rpartition("_")
-        stem, unit = (stem, unit) if stem else (name, "")
+    """Split ``height_nm``, ``height[nm]``, ``height (nm)``, ``height/nm`` or ``height nm`` into stem and unit.
+
+    The unit is None where there is none; behind a slash or a blank it is one of those known for the three quantities.
+    """
+    if match := BRACKETS.fullmatch(name):
+        return match["stem"], _plain(match["unit"]) or None
+    if (match := _LAST.fullmatch(name)) and (unit := _plain(match["unit"])) in _PLAIN:
+        return match["stem"], unit
+    stem, _, unit = name.rpartition("_")
+    return (stem, _plain(unit) or None) if stem else (name, None)
+
+
+def _plain(unit: str) -> str:
+    """A unit in the letters that it has here."""
     for sign, plain in _PLAIN_SIGNS.items():
         unit = unit.replace(sign, plain)
-    return stem, _WORDS.get(unit.lower().removesuffix("s"), unit) or None
+    return _WORDS.get(unit.lower().removesuffix("s"), unit)

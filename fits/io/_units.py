@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
 
 from fits.io._errors import DataError
-from fits.io._quantity import BRACKETS, LENGTH, VOLTAGE, Quantity, split_unit
+from fits.io._quantity import BRACKETS, LENGTH, TIME, VOLTAGE, Quantity, split_unit
 from fits.io.columns import COLUMNS
 
 QUANTITIES = (
-    Quantity("time", "s", {"s": 0, "ms": -3, "us": -6, "ns": -9}),
+    Quantity("time", "s", TIME),
     Quantity("voltage", "V", VOLTAGE),
     Quantity("displacement", "um", LENGTH),
     *(column.quantity for column in COLUMNS.values()),

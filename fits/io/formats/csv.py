@@ -82,9 +82,10 @@ def _open_text(path: str, text: str) -> TextTable:
         # A comment may be the header, if it states a unit.
         _, noted = _first_lines(text, comments=True)
         at, mark, below, unit_line = _header(noted, declared)
-        if not any(map(known_unit, _names(noted[at][2], mark))) and unit_line is None:
-            number, start, line = lines[k]
-            numbered = tuple(str(i) for i in range(1, len(_names(line, separator)) + 1))
+        number, start, line = lines[k]
+        width, said = len(_names(line, separator)), _names(noted[at][2], mark)
+        if unit_line is None and not (len(said) == width and any(map(known_unit, said))):
+            numbered = tuple(str(i) for i in range(1, width + 1))
             return checked(TextTable(path, numbered, number - 1, separator, text[start:], None, False))
         lines, k, separator, first, units = noted, at, mark, below, unit_line
     number, _, line = lines[k]
