@@ -5,7 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _command import files, refused, run, whole_picture
+from _command import files, refused, run, says_the_same_with_jax, whole_picture
 from _models import ends_um, limits_V, nested_voltages, play, random_model, starts, stroke_um
 
 from fits import (
@@ -189,6 +189,26 @@ def test_the_command_refuses_in_one_sentence(model_file, tmp_path):
     assert run("compensate", path, csv, "--out", out, "--static").exit_code == 0
     assert run("compensate", path, csv, "--out", tmp_path / "v.npz").exit_code == 0
     assert np.load(tmp_path / "v.npz")["voltage_V"].tolist() == [read(out)[1][1][0]]
+
+
+def test_a_program_beyond_the_range_by_the_noise_of_a_readback_is_taken_at_its_end(model_file, tmp_path, monkeypatch):
+    model, path = model_file
+    lower_V, upper_V = limits_V(model)
+    csv, out, found = tmp_path / "program.csv", tmp_path / "p.csv", []
+    for beyond in (0.0, 5e-4, 2e-3):
+        highest_V = upper_V + beyond * (upper_V - lower_V)
+        csv.write_text(f"time_s,voltage_V\n0,{lower_V}\n1,{highest_V!r}\n2,{(lower_V + upper_V) / 2}\n")
+        says_the_same_with_jax(monkeypatch, ["simulate", path, csv], out)
+        done = run("simulate", path, csv, "--out", out, "--json")
+        if beyond < 1e-3:
+            found.append((read(out)[1], json.loads(done.stdout)["remarks"]))
+    refused(done, "sample 2", f"asks for {highest_V:g} V", "clip the program")
+    (plain, nothing), (noisy, said) = found
+    np.testing.assert_array_equal(noisy[2], plain[2])
+    assert noisy[1][1] > plain[1][1] == upper_V
+    assert nothing == []
+    assert "at 1 of 3 samples the voltage is beyond" in said[0]
+    assert "taken as the end of that" in said[0]
 
 
 def test_a_reference_at_rest_can_be_drawn(rng, tmp_path):

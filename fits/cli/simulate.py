@@ -21,7 +21,8 @@ def simulate(given: common.Given) -> None:
     """Predict the displacement of a voltage program, with its standard deviation.
 
     PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
-    displacement_sd_um; sensor noise is not in the last.
+    displacement_sd_um; sensor noise is not in the last. Voltages beyond the model's range, by less than a thousandth
+    of it, are taken as its ends, with a remark; others are refused.
     """
     import numpy as np
 
@@ -42,7 +43,7 @@ def simulate(given: common.Given) -> None:
         "displacement_min_um": float(displacement_um.min()),
         "displacement_max_um": float(displacement_um.max()),
         "displacement_sd_median_um": float(np.median(sd_um)) if known else None,
-        "remarks": list(record.warnings),
+        "remarks": list(prediction.remarks),
     }
     spread = "of unknown standard deviation, as the model has none"
     if known:
@@ -50,7 +51,7 @@ def simulate(given: common.Given) -> None:
     lines = [
         f"{len(record)} samples, {summary['displacement_min_um']:.6g} to {summary['displacement_max_um']:.6g} um, "
         f"{spread}",
-        *(f"Note: {remark}" for remark in record.warnings),
+        *(f"Note: {remark}" for remark in prediction.remarks),
         f"prediction  {given.out}",
     ]
     common.print_result(given, summary, lines)

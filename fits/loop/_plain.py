@@ -15,7 +15,7 @@ from fits.io._errors import DataError
 from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
 from fits.loop._path import Path
-from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, refuse_outside, too_deep
+from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, inside, too_deep
 from fits.loop._surface import Surface, Visits, basis
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
@@ -122,12 +122,12 @@ class PlainLoop(PlainModel):
 
     def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
         """See `PlainModel`."""
-        refuse_outside(record, *self.range_V)
+        record = inside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
         sd_um = np.full(len(record), np.nan)
         if self.uncertainty is not None:
             sd_um = self.uncertainty.sd_um(path, progress)
-        return Prediction(self._respond(path), sd_um)
+        return Prediction(self._respond(path), sd_um, record.warnings)
 
     def play(self, record: Record, initial: str) -> np.ndarray:
         """See `PlainModel`."""

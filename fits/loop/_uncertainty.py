@@ -10,7 +10,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid
 from fits.loop._plain import Perturbations
-from fits.loop._prediction import Prediction, refuse_outside
+from fits.loop._prediction import Prediction, inside
 from fits.loop._run import Run, prepare_run, simulate_run
 from microid import Preisach, Stage
 
@@ -56,6 +56,5 @@ class Uncertainty(AbstractUncertainty):
         if not isinstance(model, Preisach):
             raise DataError("the uncertainty is that of a hysteresis, and the model is a stage: fit it again")
         range_V = float(model.density.lower_V), float(model.density.upper_V)
-        refuse_outside(record, *range_V)
-        run = prepare_run(record, range_V, initial, holdout=1.0)
-        return Prediction(simulate_run(model, run), self.sd_um(model, run))
+        run = prepare_run(inside(record, *range_V), range_V, initial, holdout=1.0)
+        return Prediction(simulate_run(model, run), self.sd_um(model, run), run.record.warnings)

@@ -17,7 +17,7 @@ from fits.io._threads import one_thread
 from fits.loop._path import Path
 from fits.loop._plain import PlainLoop, PlainModel, extremes_V
 from fits.loop._plain_file import ODD, array_of, fields_of, plain_loop, read_directions, read_law
-from fits.loop._prediction import Prediction, refuse_outside
+from fits.loop._prediction import Prediction, inside
 from fits.loop._stepped import intervals, stepped
 from fits.loop._surface import Surface
 from fits.stage._declared import tools
@@ -98,11 +98,12 @@ class PlainStage(PlainModel):
     @_in_numpy
     def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
         """See `PlainModel`."""
-        refuse_outside(record, *self.range_V)
+        record = inside(record, *self.range_V)
         sd_um = np.full(len(record), np.nan)
         if self.uncertainty is not None:
             sd_um = self._sd_um(self.uncertainty, record, initial, progress)
-        return Prediction(self._respond(self.parts, record, initial, self.substeps)[:: self.substeps], sd_um)
+        moved_um = self._respond(self.parts, record, initial, self.substeps)[:: self.substeps]
+        return Prediction(moved_um, sd_um, record.warnings)
 
     @_in_numpy
     def play(self, record: Record, initial: str) -> np.ndarray:

@@ -17,7 +17,7 @@ from fits.io._kept import kept
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._past import past_columns
-from fits.loop._prediction import refuse_outside
+from fits.loop._prediction import inside
 from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare_run
 
 # Relative size of what is too small to be seen.
@@ -220,7 +220,7 @@ def prepare_program(stage: m.Stage, record: Record, initial: str) -> tuple[m.Sta
     A `DataError` if it leaves the range that the stage was fitted on, or lacks a column that the stage depends on.
     """
     range_V = range_of(stage)
-    refuse_outside(record, *range_V)
+    record = inside(record, *range_V)
     needed = {name for part in stage.parts if isinstance(part, m.effects.AbstractEffect) for name in part.needs}
     # What nothing depends on would only make another program of the same.
     program = replace(record, displacement_um=None, extra=record.extra if needed else {})

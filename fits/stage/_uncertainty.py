@@ -56,7 +56,9 @@ class StageUncertainty(AbstractUncertainty):
         z = chain.coordinates.of(stage)
         out, slope, _ = linearise(chain, z, None, run)
         square = along(chain, z, None, run, directions, slope, lambda moved: np.sum((moved - mean) ** 2, axis=1))
-        return Prediction(out[: len(run.record)], np.sqrt(square + float(self.discrepancy_um) ** 2))
+        return Prediction(
+            out[: len(run.record)], np.sqrt(square + float(self.discrepancy_um) ** 2), run.record.warnings
+        )
 
 
 def _stage(model: Preisach | Stage) -> Stage:
@@ -206,7 +208,7 @@ def predict(
     if uncertainty is not None:
         return uncertainty.predict(model, record, initial)
     stage, run = prepare_program(as_stage(model), record, initial)
-    return Prediction(simulate_stage(stage, run), np.full(len(record), np.nan))
+    return Prediction(simulate_stage(stage, run), np.full(len(record), np.nan), run.record.warnings)
 
 
 def draw_plants(
