@@ -120,12 +120,21 @@ def test_it_says_what_feedback_is_worth(folder, tmp_path):
         (0.5, "takes 50 % off"),
         (0.04, "takes 4 % off"),
         (-0.5, "nothing off"),
+        (-0.005, "nothing off"),
         (None, "nothing off"),
     ):
         said = describe_control(told | {"worth": told["worth"] | {"share": share}})
         assert part in said
-        alone = "better" if share and share < 0 else "as well"
+        alone = "better" if share == -0.5 else "as well"
         assert (f"'microid compensate' does {alone}" in said) == (share != 0.5)
+        led = describe_control(told | {"worth": told["worth"] | {"share": share}, "feedforward": "dynamic"})
+        assert ("'microid compensate --dynamic' does" in led) == (share != 0.5)
+    # What the inverse of the whole stage leaves is told where another feedforward is used.
+    led = json.loads(run(*words, "1e-12,0,0", "--feedforward", "dynamic", "--json").stdout)
+    assert told["inverse_alone_um"] == pytest.approx(led["tracking"]["error_rms_um"], rel=1e-4)
+    assert led["inverse_alone_um"] is None
+    assert " over all plants: --feedforward dynamic" in describe_control(told)
+    assert "alone leaves" not in describe_control(led)
 
 
 @pytest.mark.study

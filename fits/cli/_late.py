@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from microid._late import late
 
 if TYPE_CHECKING:
+    from fits.control._alone import inverse_alone
     from fits.control._compensate import compensate, static_equivalent
     from fits.control._export_c import export_c
     from fits.control._export_simulation import export_simulation_c

@@ -171,9 +171,14 @@ def control(given: common.Given) -> None:
         to_draw = run, made.controller, loop.plants
         how: dict[str, Any] = {"delay": given.delay, "goal": goal, "form": given.form}
         drawn = [] if drawings is None else late.plot_control(*to_draw, drawings, **how)
-        about = {"controller": given.controller, "out": given.out, "plots": common.paths_in(given.plots, drawn)}
+        about = {"controller": given.controller, "feedforward": given.feedforward}
+        about |= {"out": given.out, "plots": common.paths_in(given.plots, drawn)}
+        dynamic = given.feedforward == "dynamic"
+        place: dict[str, Any] = {"initial": given.initial, "limits_V": volts}
+        alone_um = None if dynamic else late.inverse_alone(plant, wanted, loop, **place)
         # Before the file is in its place: what cannot be told is not left behind either.
-        summary = late.control_json(loop, made, played, about, [*wanted.warnings, *ready.remarks, *more])
+        remarks = [*wanted.warnings, *ready.remarks, *more]
+        summary = late.control_json(loop, made, played, about, remarks, alone_um)
         told = late.finite_json(summary) if given.as_json else late.describe_control(summary)
     click.echo(told)
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fits.control._compensate import respond
+from fits.control._alone import played_alone
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
 from fits.control._tune_problem import Tuning
@@ -17,15 +17,23 @@ from microid.control import ControlledRun, StepMetrics, step_metrics, tracking_e
 
 # Feedback that takes off less than this share is hardly worth its trouble.
 _PAYS = 0.1
-_ALONE = "'microid compensate' does {}, as long as the stage stays as its model is"
+# Errors that differ by less than this share are the same.
+_SAME = 0.01
+_ALONE = "'{}' does {}, as long as the stage stays as its model is"
 
 
 def control_json(
-    loop: Loop, made: Made, played: Sequence[ControlledRun], about: Mapping[str, Any], remarks: Sequence[str]
+    loop: Loop,
+    made: Made,
+    played: Sequence[ControlledRun],
+    about: Mapping[str, Any],
+    remarks: Sequence[str],
+    inverse_um: Sequence[np.ndarray] | None = None,
 ) -> dict[str, Any]:
     """Put runs of a loop with a controller, one for each plant, into JSON values, `microid.control/1`.
 
-    What is not finite is None. What it is `about` comes first, and more remarks may follow those that are known.
+    What is not finite is None. What it is `about`, with the feedforward, comes first, and more remarks may follow
+    those that are known. What the inverse of the whole stage reaches alone, by plant, is from `inverse_alone`.
     """
     run, kept = played[0], slice(loop.skip, None)
     wanted, moved, command = (np.asarray(x) for x in (run.reference_um, run.displacement_um, run.command_V))
@@ -38,7 +46,9 @@ def control_json(
             f"the error, {length(rms)} rms, is that of the model's own displacement and below the sensor's "
             f"{' and its '.join(below)}: a bench cannot show it in single readings"
         )
-    every, without = loop.margins(made.controller), _without(loop, kept)
+    every, alone = loop.margins(made.controller), played_alone(loop, loop.ready)
+    without = alone and [one[kept] for one in alone]
+    inverse = inverse_um and _over_all(wanted[kept], [one[kept] for one in inverse_um])
     found = {
         "schema": "microid.control/1",
         **about,
@@ -57,6 +67,7 @@ def control_json(
         "tracking": _tracking(wanted[kept], moved[kept]),
         "without_feedback": without and _tracking(wanted[kept], without[0]),
         "worth": without and _worth(wanted[kept], [np.asarray(one.displacement_um)[kept] for one in played], without),
+        "inverse_alone_um": inverse,
         "step": _step(np.asarray(run.time_s), wanted, moved),
         "command_min_V": command.min(),
         "command_max_V": command.max(),
@@ -86,18 +97,14 @@ def _tracking(wanted_um: np.ndarray, moved_um: np.ndarray) -> dict[str, Any]:
     return {**sizes, "e_rms_pct": shares.e_rms_pct, "e_max_pct": shares.e_max_pct}
 
 
-def _without(loop: Loop, kept: slice) -> list[np.ndarray] | None:
-    """Displacement of every plant under the feedforward alone; None where there is none."""
-    ready = loop.ready
-    if ready.feedforward_V is None:
-        return None
-    command = np.clip(ready.feedforward_V, *ready.limits_V)
-    return [respond(plant, ready.interval_s, command, ready.start)[kept] for plant in loop.plants]
+def _over_all(wanted_um: np.ndarray, moved_um: Sequence[np.ndarray]) -> float:
+    """Error (rms) over all plants."""
+    return _rms(np.concatenate([wanted_um - one for one in moved_um]))
 
 
 def _worth(wanted_um: np.ndarray, with_um: list[np.ndarray], without_um: list[np.ndarray]) -> dict[str, Any]:
     """What feedback takes off the error of the feedforward alone, over all plants."""
-    after, before = (_rms(np.concatenate([wanted_um - one for one in each])) for each in (with_um, without_um))
+    after, before = _over_all(wanted_um, with_um), _over_all(wanted_um, without_um)
     return {"error_rms_um": after, "without_um": before, "share": 1 - after / before if before > 0 else None}
 
 
@@ -130,7 +137,11 @@ def describe_control(summary: Mapping[str, Any]) -> str:
     )
     lines.append(f"tracking    {_tracked(summary['tracking'])}")
     if without is not None:
-        lines += [f"  without   {_tracked(without)}", f"feedback    {_said_of_worth(summary['worth'])}"]
+        lines += [f"  without   {_tracked(without)}", f"feedback    {_said_of_worth(summary)}"]
+    if (left := summary["inverse_alone_um"]) is not None:
+        lines.append(
+            f"inverse     that of the whole stage alone leaves {_long(left)} over all plants: --feedforward dynamic"
+        )
     if (step := summary["step"]) is not None:
         time_s = step["settling_time_s"]
         settled = "not settled within the record" if time_s is None else f"settled in {time_s:.4g} s"
@@ -150,12 +161,16 @@ def _tracked(found: Mapping[str, Any]) -> str:
     return f"rms {_long(found['error_rms_um'])}{shares[0]}, at most {_long(found['error_max_um'])}{shares[1]}"
 
 
-def _said_of_worth(worth: Mapping[str, Any]) -> str:
+def _said_of_worth(summary: Mapping[str, Any]) -> str:
     """Say whether the feedback pays."""
+    worth = summary["worth"]
     share, after, before = worth["share"] or 0.0, _long(worth["error_rms_um"]), _long(worth["without_um"])
     part = f"{100 * share:.3g} %" if share > 0 else "nothing"
     does = f"takes {part} off the error of the feedforward alone, {before} to {after} over all plants"
-    return does if share >= _PAYS else f"{does}; {_ALONE.format('as well' if share >= 0 else 'better')}"
+    if share >= _PAYS:
+        return does
+    command = f"microid compensate{' --dynamic' if summary['feedforward'] == 'dynamic' else ''}"
+    return f"{does}; {_ALONE.format(command, 'as well' if share >= -_SAME else 'better')}"
 
 
 def _long(size_um: float | None) -> str:
