@@ -10,6 +10,7 @@ from _sweeps import parsed
 
 import fits
 from fits.control._gains import GAINS
+from fits.control._make import strongest_Hz
 from fits.io._record import Reference
 from fits.sweeps._spec import chunk_count, compute_chunk
 from fits.sweeps._stages import memory_before, nominal_stage, varied
@@ -177,6 +178,17 @@ def test_resonators_are_at_the_frequency_of_the_reference(rng):
     assert float(own.at({}).lead_deg[0]) == 30.0
 
 
+@pytest.mark.parametrize("middle", [0.1, 0.35, 0.5, 0.8])
+def test_a_single_move_has_no_period(middle, rng):
+    """Wherever in the record it is, and in whichever direction; a sine of few periods beside it has one."""
+    x = np.linspace(0, 1, 500)
+    move = rng.choice([-1, 1]) * np.clip((x - middle) / rng.uniform(0.05, 0.2) + 0.5, 0, 1)
+    assert strongest_Hz(move, 1e-2) is None
+    assert strongest_Hz(np.zeros(500), 1e-2) is None
+    periods = rng.uniform(3, 50)
+    assert strongest_Hz(move / 50 + np.sin(2 * np.pi * periods * x), 1e-2) == pytest.approx(periods / 5, rel=0.02)
+
+
 @pytest.mark.study
 def test_gains_that_nothing_can_be_learnt_around_and_unstable_loops_fail_as_rows(rng):
     values = drawn("bp-pid", rng, 3)
@@ -215,7 +227,11 @@ def test_gains_that_nothing_can_be_learnt_around_and_unstable_loops_fail_as_rows
         ("bp-pid", "derivative_V_s_per_um = 0.0", "controller.derivative_V_s_per_um: expected 1e-12 to inf V s/um"),
         ("bp-pid", "span = 1", "controller.span: expected more than 1, found 1"),
         ("bp-pid", "seed = 1.5", "controller.seed: controller.seed is a whole number, found 1.5"),
-        ("resonant", "", "controller.frequency_Hz: expected one for a reference that does not oscillate; state it"),
+        (
+            "resonant",
+            "",
+            "controller.frequency_Hz: no period stands out in the reference, such as in a single move;",
+        ),
         ("resonant", "frequency_Hz = 600.0", "controller.frequency_Hz: expected 1e-09 to 499.999 Hz, found 600"),
     ],
 )

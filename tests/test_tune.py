@@ -1,5 +1,7 @@
 """Tuning against closed forms, NumPy's loops and finite differences, and what it must refuse."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,9 +15,11 @@ from _seed import seed_of
 import fits
 import microid as m
 import microid.control as c
+from fits.control import _make
 from fits.control._tune import _problem
 from fits.control._tune_problem import Goal, judge
 from fits.control._tune_start import ultimate_point
+from fits.io._record import Reference
 
 T = 1e-3
 SAMPLES = 160
@@ -266,3 +270,21 @@ def test_plants_are_drawn_with_the_covariance_of_the_fit(rng):
     assert fits.draw_plants(stage, 1) == (stage,)
     with pytest.raises(ValueError, match="count"):
         fits.draw_plants(stage, 0, uncertainty=known)
+
+
+def test_a_controller_made_around_another_is_told_of_as_it_was_tuned_last(monkeypatch):
+    """What was said of the PID controller alone is not said beside it, nor twice under another name."""
+    stage = m.Stage.of(piezo=m.Piezo(0.1), mechanics=m.Mechanics(200.0, 0.1))
+    at = 1e-3 * np.arange(100)
+    ready = _make.setup(stage, Reference(at, 1 - np.cos(2 * np.pi * 30 * at), "r"), "none")
+
+    def tuned(controller, *_, **__):
+        return SimpleNamespace(controller=controller, remarks=(f"of {type(controller).__name__}",))
+
+    monkeypatch.setattr(_make, "tune_controller", tuned)
+    loop = _make.Loop(ready, [stage], 0.0, 0, None, 0)
+    maker = _make.Maker(loop, Goal(), 1, 0, None, lambda _: None)
+    assert maker.make("pid", None, []).remarks == ["of PID"]
+    at_Hz, of_all = maker.make("resonant", None, []).remarks
+    assert "resonator is at 30.0" in at_Hz or "resonator is at 29.9" in at_Hz
+    assert of_all == "of ResonantPID"

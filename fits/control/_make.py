@@ -26,6 +26,8 @@ from microid import control as ctl
 
 Feedforward = Literal["none", "static", "dynamic"]
 _FEWEST = 16
+# Spectra have so many times the bins that their samples ask for.
+_FINER = 8
 
 
 @dataclass(frozen=True)
@@ -154,15 +156,18 @@ def with_defaults(
 
 
 def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
-    """Frequency of the strongest line of a reference, shape `(t,)`; None for one that stands still."""
+    """Frequency of the strongest line of a reference, shape `(t,)`; None where no period stands out.
+
+    A line with less than one and a half periods counts as none: a single move looks the same.
+    """
     n = len(reference_um)
-    size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), 8 * n))
-    k = int(np.clip(np.argmax(size), 1, len(size) - 2))
-    if size[k] <= 0:
+    size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), _FINER * n))
+    k = _FINER + int(np.argmax(size[_FINER:-1]))
+    if size[k] <= 0 or k < 1.5 * _FINER:
         return None
     left, here, right = np.log(np.maximum(size[k - 1 : k + 2], 1e-300))
     bend = left - 2 * here + right
-    return float((k + (0.5 * (left - right) / bend if bend else 0.0)) / (8 * n * interval_s))
+    return float((k + (0.5 * (left - right) / bend if bend else 0.0)) / (_FINER * n * interval_s))
 
 
 @dataclass(frozen=True)
@@ -261,7 +266,6 @@ class Maker:
             lambda: strongest_Hz(ready.reference_um, ready.interval_s),
         )
         numbers, more = with_defaults(own_settings(kind), {"seed": self.seed} | own, task, place)
-        remarks += [*said, *more]
         if "frequency_Hz" in numbers:
             self._check_frequencies(np.atleast_1d(numbers["frequency_Hz"]))
         try:
@@ -269,9 +273,10 @@ class Maker:
         except ValueError as error:
             raise DataError(f"{name}: {error}; choose pid.") from error
         if given is not None or kind.learns:
-            return Made(replaced(made, own), pid, tuning, remarks)
+            return Made(replaced(made, own), pid, tuning, [*remarks, *said, *more])
         tuning = self._tuned(self._with_margin(made))
-        return Made(tuning.controller, pid, tuning, [*remarks, *(x for x in tuning.remarks if x not in remarks)])
+        # The PID controller within is tuned anew: what was said of it alone no longer holds.
+        return Made(tuning.controller, pid, tuning, [*said, *more, *tuning.remarks])
 
     def _tuned(self, controller: Any) -> Tuning[Any]:
         ready = self.loop.ready

@@ -237,7 +237,8 @@ def _remarks(problem: Problem, best: _End, ends: Sequence[_End]) -> Iterator[str
     ends_of_rows = np.cumsum([int(np.prod(row.shape)) for row in rows])
     for row, moved in zip(rows, np.split(np.abs(np.asarray(best.y)), ends_of_rows[:-1]), strict=True):
         if np.any(moved > 0.8 * REACH):
-            yield f"{row.path} is at the edge of what is searched: it hardly matters, or the start was far off"
+            name = row.path.removeprefix("pid.")
+            yield f"{name} is at the edge of what is searched: it hardly matters, or the start was far off"
     pressing = [name for name, share in best.over.items() if np.max(share) > -_TOLERANCE]
     if pressing:
         yield f"at its limit, which is kept to {100 * _TOLERANCE:g} %: {', '.join(pressing)}"

@@ -30,7 +30,7 @@ class _State(eqx.Module):
 def _frequency_Hz(task: ControlTask) -> float:
     found = task.frequency_Hz()
     if found is None:
-        raise ValueError("expected one for a reference that does not oscillate")
+        raise ValueError("no period stands out in the reference, such as in a single move")
     return found
 
 
