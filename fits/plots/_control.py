@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 
 from fits.control._compensate import simulate_model
 from fits.control._follow import Compensation
@@ -16,7 +17,7 @@ from fits.io._record import Record, Reference
 from fits.plots._style import DARK, LIGHT, MEASURED, MODEL, WIDE_in, curve, label, legend, panels, save, save_all
 from fits.stats._metrics import TWO_SIDED_95
 from microid import Preisach, Stage
-from microid.control import AbstractController, ControlledRun, loop_gain
+from microid.control import AbstractController, ControlledRun, Margins, loop_gain, margins
 
 _STYLES: dict[str, dict[str, Any]] = {
     "reference": {"color": "0.75", "linewidth": 2.5},
@@ -26,6 +27,9 @@ _STYLES: dict[str, dict[str, Any]] = {
     "HC+BP-PID": {"color": "0.25", "linewidth": 0.7, "linestyle": "-."},
     "HC+CMAC-PID": {"color": "0.0", "linewidth": 0.7},
 }
+# What is no plant: levels to read by, and limits.
+_GUIDE: dict[str, Any] = {"color": DARK, "linewidth": 0.6, "linestyle": ":"}
+_LIMIT: dict[str, Any] = {"color": DARK, "linewidth": 0.8, "linestyle": "--"}
 _LIMITS = "gain_margin_min", "phase_margin_min_deg", "sensitivity_peak_max"
 
 
@@ -47,8 +51,9 @@ def plot_control(
     """
     time_s = np.asarray(run.time_s)
     picture, (above, error, below) = panels(WIDE_in, 5.2, 3, 1, sharex=True, height_ratios=(1.6, 1, 1))
-    curve(above, time_s, np.asarray(run.measured_um), "measured", **MEASURED)
-    curve(above, time_s, np.asarray(run.reference_um), "reference", color=DARK, linewidth=0.9, linestyle="--")
+    # One within the other, as all three are nearly the same.
+    curve(above, time_s, np.asarray(run.reference_um), "reference", color="0.85", linewidth=5.0)
+    curve(above, time_s, np.asarray(run.measured_um), "measured", color="0.55", linewidth=2.4)
     curve(above, time_s, np.asarray(run.displacement_um), "displacement", **MODEL)
     error.axhline(0.0, color=LIGHT, linewidth=0.6)
     curve(error, time_s, np.asarray(run.error_um), **MODEL)
@@ -75,19 +80,46 @@ def plot_control(
         size.loglog(frequency, np.abs(gain), label=words, **style)
         turn.semilogx(frequency, np.degrees(np.unwrap(np.angle(gain))), **style)
         peak.semilogx(frequency, np.abs(1 / (1 + gain)), **style)
-    least, phase_deg, most = (getattr(goal, name, None) for name in _LIMITS)
-    ends = 1 / least if least else None, phase_deg - 180 if phase_deg is not None else None, most
-    words = "limit: gain at -180°, phase at gain 1, peak"
-    for axes, level, limit in zip((size, turn, peak), (1.0, -180.0, 1.0), ends, strict=True):
-        axes.axhline(level, color=LIGHT, linewidth=0.6, zorder=0)
-        if limit is not None:
-            axes.axhline(limit, color=DARK, linewidth=0.7, linestyle="--", label=words if axes is size else "")
     peak.set_xlim(coarse[0], coarse[-1])
+    for axes, level in zip((size, turn, peak), (1.0, -180.0, 1.0), strict=True):
+        axes.axhline(level, zorder=0, **_GUIDE)
+    found_margins = margins(linear, plants[0], delay=delay, slope_um_per_V=slope_array(plants[0]))
+    _mark_margins((size, turn, peak), found_margins, goal)
     label(size, "", "loop gain")
     label(turn, "", "phase (°)")
     label(peak, "frequency (Hz)", "sensitivity")
-    legend(picture, (size,))
+    legend(picture, (size, peak))
     return save_all(pictures | {"margins": picture}, folder, form)
+
+
+def _mark_margins(panels_of: Sequence[Axes], found: Margins, goal: Goal | None) -> None:
+    """Mark gain margin, phase margin and peak of the sensitivity on the model's curves, limits where they hold."""
+    size, turn, peak = panels_of
+    frequency, phases = (np.asarray(x) for x in turn.lines[-2].get_data())
+    least, most_deg, most = (getattr(goal, name, None) for name in _LIMITS)
+    gain, gain_Hz, phase_Hz, high = (
+        float(x) for x in (found.gain_margin, found.gain_margin_Hz, found.phase_margin_Hz, found.sensitivity_peak)
+    )
+    if gain_Hz > 0:
+        _mark(size, gain_Hz, 1 / gain, f"gain margin {gain:.3g} at {gain_Hz:.3g} Hz", 1 / least if least else None)
+    if phase_Hz > 0:
+        phase = float(np.interp(phase_Hz, frequency, phases))
+        # -180 degrees, or a whole turn from there.
+        level = 360 * round((phase + 180) / 360) - 180
+        limit = None if most_deg is None else level + np.copysign(most_deg, phase - level)
+        _mark(turn, phase_Hz, phase, f"phase margin {abs(phase - level):.3g}° at {phase_Hz:.3g} Hz", limit)
+    if most is not None:
+        peak.axhline(most, label="limit", **_LIMIT)
+    peak_Hz = float(found.sensitivity_peak_Hz)
+    _mark(peak, peak_Hz, high, f"peak {high:.3g} at {peak_Hz:.3g} Hz", None)
+
+
+def _mark(axes: Axes, frequency_Hz: float, level: float, words: str, limit: float | None) -> None:
+    """A dot, a short line at its limit, and above the panel what it is."""
+    if limit is not None:
+        axes.plot([frequency_Hz / 1.25, frequency_Hz * 1.25], [limit, limit], label="limit", **_LIMIT)
+    axes.plot(frequency_Hz, level, "o", color="0.0", markersize=3.5)
+    label(axes, title=words)
 
 
 def plot_compensation(

@@ -38,6 +38,8 @@ class Margins(eqx.Module):
         Least factor above one by which the loop gain comes to -1; `inf` if there is none.
     phase_margin_deg
         Least turn of the loop gain, either way, by which it comes to -1; `inf` if its modulus is never one.
+    gain_margin_Hz, phase_margin_Hz
+        Where these are; 0 if there is none.
     crossover_Hz
         Highest frequency at which the loop gain has modulus one; 0 if there is none.
     sensitivity_peak, sensitivity_peak_Hz
@@ -52,6 +54,8 @@ class Margins(eqx.Module):
     radius: Float[Array, ""]
     gain_margin: Float[Array, ""]
     phase_margin_deg: Float[Array, ""]
+    gain_margin_Hz: Float[Array, ""]
+    phase_margin_Hz: Float[Array, ""]
     crossover_Hz: Float[Array, ""]
     sensitivity_peak: Float[Array, ""]
     sensitivity_peak_Hz: Float[Array, ""]
@@ -189,15 +193,23 @@ def margins(
     # At half the sampling rate the loop gain is real.
     depth = jnp.append(-jnp.real(loop(turned)), -jnp.real(loop(nyquist[None])))
     counted = jnp.append(sides, True) & (depth > 0) & (depth < 1)
-    gain = jnp.min(jnp.where(counted, 1 / jnp.where(counted, depth, 1), jnp.inf))
+    factors = jnp.where(counted, 1 / jnp.where(counted, depth, 1), jnp.inf)
+    gain, at_gain = jnp.min(factors), _where_least(factors, jnp.append(turned, nyquist))
     unity, crossed = _crossings(lambda loop, f: jnp.log(jnp.abs(loop(f))), loop, still, grid)
     reached = loop(jnp.where(crossed, unity, nyquist / 3))
     angle = jnp.abs(jnp.arctan2(-jnp.imag(reached), -jnp.real(reached))) * (180 / jnp.pi)
-    phase = jnp.min(jnp.where(crossed, angle, jnp.inf))
+    turns = jnp.where(crossed, angle, jnp.inf)
+    phase, at_phase = jnp.min(turns), _where_least(turns, unity)
     crossover = jnp.max(jnp.where(crossed, unity, 0))
     peak_Hz = _peak(lambda f: 1 / jnp.abs(1 + still(f)), grid)
     peak = 1 / jnp.abs(1 + loop(peak_Hz[None])[0])
-    return Margins(stable, radius, gain, phase, crossover, peak, peak_Hz, noise[0], noise[1])
+    return Margins(stable, radius, gain, phase, at_gain, at_phase, crossover, peak, peak_Hz, noise[0], noise[1])
+
+
+def _where_least(values: Float[Array, " k"], frequency_Hz: Float[Array, " k"]) -> Float[Array, ""]:
+    """Frequency of the least of some values; 0 if none is finite."""
+    place = jnp.argmin(values)
+    return jnp.where(jnp.isfinite(values[place]), lax.stop_gradient(frequency_Hz[place]), 0)
 
 
 def require_stable(found: Margins) -> Margins:
