@@ -10,11 +10,12 @@ from _diagnosis import KINDS, diagnosis, run_view
 
 from fits import ParameterEstimate
 from fits.diagnosis._result import Gain, RunView
+from fits.plots._diagnosis import residual_figure
 from fits.plots._residual_views import VIEWS
 from fits.plots._style import thinned
 from fits.report._diagnosis import report_html
 from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
-from fits.report._words import chance, estimate, number, parameter_name, percent, shown_unit, sigmas
+from fits.report._words import chance, estimate, heading, number, parameter_name, percent, plain, shown_unit, sigmas
 from microid.effects import card_of
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -166,6 +167,26 @@ def test_report_is_one_whole_page(rng, kind):
         assert set(re.findall(r'<dt id="(\w+)">', text)) <= linked
     assert "nan" not in re.sub(r"[a-z]{4,}", "", words.lower()).split()
     assert len(set(page.ids)) == len(page.ids)
+
+
+def test_the_stage_stands_right_behind_what_was_read_and_names_are_written_as_people_write_them(rng):
+    found = diagnosis(rng)
+    found = replace(found, causes=(replace(found.causes[0], name="bouc_wen_hysteresis"),))
+    text = report_html(found)
+    heads = re.findall("<h2>(.*?)</h2>", text)
+    assert heads[1:3] == ["What was read", "The stage, before and after"]
+    assert "<h3>Bouc-Wen hysteresis</h3>" in text
+    assert "The stage shows Bouc-Wen hysteresis or thermal drift." in text
+    assert "bouc wen" not in text.lower()
+    assert "displacement_um is 0 at rest at the lowest voltage" in text
+    assert (plain("mains_hum"), heading("mains_hum")) == ("mains hum", "Mains hum")
+
+
+def test_the_band_of_the_noise_lies_over_the_curves_and_lets_them_through(rng):
+    (axes, *_) = residual_figure(diagnosis(rng)).axes
+    (band,) = [patch for patch in axes.patches if patch.get_alpha() is not None]
+    assert 0 < band.get_alpha() < 0.3
+    assert band.get_zorder() > max(line.get_zorder() for line in axes.lines if len(line.get_xdata()) > 2)
 
 
 def test_the_same_diagnosis_gives_the_same_report(rng):

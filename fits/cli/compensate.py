@@ -32,8 +32,9 @@ from fits.io._length import length
 def compensate(given: common.Given) -> None:
     """Find the voltage that makes the stage follow a reference.
 
-    REFERENCE.csv needs the columns time_s and displacement_um: what the sensor is to read, its offset included. The
-    result has time_s, voltage_V and displacement_um, which is what the model then does.
+    REFERENCE.csv needs the columns time_s and displacement_um: what the sensor is to read, with the model's
+    offset_um at rest at the lowest voltage: 0 for the models of diagnose. The result has time_s, voltage_V and
+    displacement_um, which is what the model then does.
     """
     import numpy as np
 

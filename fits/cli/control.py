@@ -87,10 +87,11 @@ def _names() -> list[str]:
 def control(given: common.Given) -> None:
     """Tune a controller on a model, and run it along a reference.
 
-    REFERENCE.csv needs the columns time_s, in even steps, and displacement_um: what the sensor is to read, its offset
-    included. The run has time_s, reference_um, displacement_um, measured_um, command_V and error_um. The least error
-    is sought within all limits, for every plant; a loop that is unstable or beyond a limit is refused. What --json
-    prints makes the same controller again with --gains, for the same model, reference and seed.
+    REFERENCE.csv needs the columns time_s, in even steps, and displacement_um: what the sensor is to read, with the
+    model's offset_um at rest at the lowest voltage: 0 for the models of diagnose. The run has time_s, reference_um,
+    displacement_um, measured_um, command_V and error_um. The least error is sought within all limits, for every
+    plant; a loop that is unstable or beyond a limit is refused. What --json prints makes the same controller again
+    with --gains, for the same model, reference and seed.
     """
     import numpy as np
 

@@ -23,7 +23,7 @@ from microid.effects import card_of
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 BEFORE, AFTER = "#d55e00", "#0072b2"
-NOISE, ASIDE, INK = "#d9dde2", "#f4f1e4", "#22272e"
+ASIDE, INK = "#f4f1e4", "#22272e"
 # Width of the column and of a phone, in CSS pixels over 96.
 _WIDE_in, _NARROW_in = 7.3, 3.4
 # Points of all curves of one picture together.
@@ -113,8 +113,8 @@ def residual_figure(diagnosis: Diagnosis, width_in: float = _WIDE_in) -> Figure:
             keep = thinned(values, points)
             axes.plot(run.time_s[keep], per_um * values[keep], color=colour, linewidth=line, label=name)
         if np.isfinite(band):
-            axes.axhspan(-band, band, color=NOISE, linewidth=0)
-            # Over the curves, which else hide the band.
+            # Over the curves, which else hide the band, and as light as in the key.
+            axes.axhspan(-band, band, color=INK, alpha=0.16, linewidth=0, zorder=2.5)
             for edge in (-band, band):
                 axes.axhline(edge, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=3)
         axes.set_xlim(run.time_s[0], run.time_s[-1])

@@ -15,6 +15,7 @@ from fits.report._words import (
     SIGMA,
     chance,
     estimate,
+    heading,
     length,
     listed,
     number,
@@ -39,11 +40,10 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
     asked.sort(key=lambda one: -one.bound_um if math.isfinite(one.bound_um) else math.inf)
     gain = diagnosis.gain
     bounds = [
-        (plain(one.name).capitalize(), sigmas(one.z), percent(one.absorbed_fraction), length(one.bound_um))
-        for one in asked
+        (heading(one.name), sigmas(one.z), percent(one.absorbed_fraction), length(one.bound_um)) for one in asked
     ]
     tests = [
-        (plain(one.name).capitalize(), sigmas(one.statistic), chance(one.p), share, one.sentence)
+        (heading(one.name), sigmas(one.statistic), chance(one.p), share, one.sentence)
         for one in diagnosis.tests
         # What compares samples with one another explains no part of them.
         for share in [percent(one.share) if one.share > 0 else _words.NONE]
@@ -89,7 +89,18 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
 def _with_words() -> Environment:
     """Templates, and the words of a diagnosis in them."""
     made = environment()
-    for name in ("headline", "verdict_sentence", "plain", "listed", "sigmas", "chance", "percent", "number", "whole"):
+    for name in (
+        "headline",
+        "verdict_sentence",
+        "plain",
+        "heading",
+        "listed",
+        "sigmas",
+        "chance",
+        "percent",
+        "number",
+        "whole",
+    ):
         made.filters[name] = getattr(_words, name)
     made.filters["length_of"] = length
     made.filters["without_dot"] = lambda text: text.rstrip(".")

@@ -8,7 +8,7 @@ import numpy as np
 from fits.diagnosis._result import SMALLEST_P, Diagnosis, FoundCause, RunView
 from fits.io import _length
 from fits.loop._result import ParameterEstimate
-from microid.effects import card_of
+from microid.effects import EFFECTS, card_of
 
 # A residual of more times the noise floor is not called noise.
 NOISY = 1.2
@@ -22,7 +22,15 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def plain(name: str) -> str:
-    return name.replace("_", " ")
+    """Write a name in words: the title of an effect that has one."""
+    titles = (effect.title for effect in EFFECTS if effect.name == name)
+    return next(filter(None, titles), name.replace("_", " "))
+
+
+def heading(name: str) -> str:
+    """The same with a capital at the beginning."""
+    words = plain(name)
+    return words[:1].upper() + words[1:]
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:

@@ -74,6 +74,8 @@ class AbstractEffect(AbstractPart):
     ----------
     name
         Name of the effect, that of its file.
+    title
+        The name in words, where those are not the name without underscores.
     form
         Which of several models of that effect this is; empty where there is one.
     place
@@ -144,6 +146,7 @@ class AbstractEffect(AbstractPart):
     confusions: eqx.AbstractClassVar[tuple[str, ...]]
     experiment: eqx.AbstractClassVar[str]
     source: eqx.AbstractClassVar[str]
+    title: ClassVar[str] = ""
     form: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]] = ()
     unless: ClassVar[tuple[str, ...]] = ()

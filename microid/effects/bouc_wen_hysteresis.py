@@ -53,6 +53,7 @@ class BoucWenHysteresis(AbstractEffect):
     """
 
     name: ClassVar[str] = "bouc_wen_hysteresis"
+    title: ClassVar[str] = "Bouc-Wen hysteresis"
     takes: ClassVar[str] = "V"
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
