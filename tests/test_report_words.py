@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, cause, diagnosis
 
+from fits import ParameterEstimate
 from fits.diagnosis._conclude import not_named
 from fits.diagnosis._result import Gain
-from fits.loop._report_words import _row
+from fits.loop._report_words import UNSEEN, _row, parameter_lines
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
-from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
+from fits.report._words import NONE, estimate, headline, length, number, plain, spread, verdict_sentence
 from microid.effects import EFFECTS, Scales, extend
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
@@ -296,3 +297,20 @@ def test_one_suspect_is_not_spoken_of_as_several():
     assert not_named(["creep"], "w").endswith("creep came nearest to what is left, but w: it is not named")
     assert not_named(["creep", "load_change"], "w").startswith("creep, load change came nearest")
     assert not_named(["creep", "load_change"], "w").endswith("none of them is named")
+
+
+def test_a_parameter_at_its_bound_that_nothing_shows_gets_no_numbers(rng):
+    """A time constant of nothing is seen where the interval is short, and not where it may be anything."""
+    open_end = ParameterEstimate("driver.time_constant_s", "s", 2e-9, 5.7, 1e-9, 22.4)
+    short = replace(open_end, sd=1e-6, upper=2e-6)
+    at_zero = replace(open_end, value=0.0, lower=0.0)
+    for one, seen in ((open_end, False), (short, True), (at_zero, True), (replace(open_end, value=1.0), True)):
+        (line,) = parameter_lines([vars(one)])
+        assert (UNSEEN in line) != seen
+        assert (UNSEEN in estimate(one)) != seen
+        found = diagnosis(rng)
+        found = replace(found, causes=(replace(found.causes[0], parameters=(one,)),), baseline_parameters=(one,))
+        assert (UNSEEN in found.summary()) != seen
+        assert (UNSEEN in stage_parameters(found)[1]) != seen
+        if not seen:
+            assert "22.4" not in line + found.summary() + " ".join(stage_parameters(found)[1])

@@ -11,6 +11,7 @@ import numpy as np
 from fits.io._length import length
 from fits.io._limits import Extreme
 from fits.io._summary import AbstractSummary
+from fits.loop._report_words import UNSEEN, is_seen
 from fits.loop._result import ParameterEstimate
 from fits.stage._uncertainty import StageUncertainty
 from microid import Stage
@@ -204,6 +205,9 @@ class Diagnosis(AbstractSummary):
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
                 lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the {whole}")
             for each in cause.parameters:
+                if not is_seen(each.value, each.lower, each.upper):
+                    lines.append(f"    {each.name:24} {UNSEEN}")
+                    continue
                 unit = "" if each.unit == "1" else f" {each.unit}"
                 below, above = each.value - each.lower, each.upper - each.value
                 # An interval that ends at a bound, or reaches farther to one side, is no standard deviation.

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from math import floor, log10
+from math import floor, inf, log10
 from typing import Any
 
 from fits.io._json import columns
@@ -108,19 +108,29 @@ def _verdict(report: Mapping[str, Any]) -> str:
     )
 
 
+# A parameter at a bound is put 1e-6 of its scale away from it: nothing is known of one that may be ten scales away.
+_AT_BOUND = 1e-7
+UNSEEN = "not seen in these runs"
+
+
+def is_seen(value: float | None, lower: float | None, upper: float | None) -> bool:
+    """Whether runs show a parameter: not one at a bound whose 95 % interval is open on the other side."""
+    if value is None or lower is None or upper is None or not lower < value < upper < inf:
+        return True
+    return min(value - lower, upper - value) >= _AT_BOUND * (upper - lower)
+
+
 def parameter_lines(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
     """A table of parameters of a report: values, standard deviations, 95 % intervals and units."""
-    return columns(
-        [
-            (
-                one["name"],
-                f"{_value(one)} ± {'unknown' if one['sd'] is None else format(one['sd'], '.2g')}",
-                f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})",
-                "" if one["unit"] == "1" else one["unit"],
-            )
-            for one in parameters
-        ]
-    )
+    return columns([_parameter_row(one) for one in parameters])
+
+
+def _parameter_row(one: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    if not is_seen(one["value"], one["lower"], one["upper"]):
+        return one["name"], UNSEEN, "", ""
+    sd = "unknown" if one["sd"] is None else format(one["sd"], ".2g")
+    interval = f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})"
+    return one["name"], f"{_value(one)} ± {sd}", interval, "" if one["unit"] == "1" else one["unit"]
 
 
 def _parameters(report: Mapping[str, Any]) -> list[str]:
