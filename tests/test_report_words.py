@@ -244,7 +244,15 @@ def test_commands_name_the_runs_and_those_held_out(rng):
     assert "the end was held out" in partly_fitted(runs[:1], True)
     assert "nothing was held out" in partly_fitted(runs[:1], False)
     assert partly_fitted(runs[1:], True) == ""
-    assert runs_read(runs)[0][1:4] == ("3000", number(np.ptp(first.time_s)), number(np.ptp(first.voltage_V)))
+    row = "3000", "100", number(np.ptp(first.time_s)), number(np.ptp(first.voltage_V)), "voltage, displacement"
+    assert runs_read(runs)[0][1:6] == row
+    warm = replace(runs[1], extra=("temperature_degC",), time_s=runs[1].time_s ** 1.1)
+    rows = runs_read((runs[0], warm), ("data/slow.csv", "more/a b.csv"))
+    assert [one[0] for one in rows] == ["data/slow.csv", "more/a b.csv"]
+    assert rows[1][2].startswith("uneven")
+    assert rows[1][5] == "voltage, displacement, temperature degC"
+    assert "data/slow.csv" in report_html(found, "", ("data/slow.csv", "more/a b.csv"))
+    assert [one[0] for one in runs_read(runs, ("elsewhere.csv",))] == ["slow.csv", "a b.csv"]
     silent = replace(found, verdict="unexplained", next_experiment=None)
     assert next_steps(silent)[-1][0].startswith("Record a run at another speed")
 

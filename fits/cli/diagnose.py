@@ -77,12 +77,12 @@ def diagnose(given: common.Given) -> None:
     )
     progress(late.Step.WRITING)
     content = late.diagnosis_json(diagnosis)
-    places = _write(diagnosis, content, given.out)
+    places = _write(diagnosis, content, given.out, [*given.runs, *files])
     common.print_result(given, {"out": given.out, "files": places, **content}, [diagnosis.summary(), "", *places])
 
 
-def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> list[str]:
-    """Write all files, or none; their names come back."""
+def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str, read: list[str]) -> list[str]:
+    """Write all files, or none, of runs that were read from files; the names of what is written come back."""
 
     def model(which: str) -> str:
         stage = diagnosis.baseline if which == "baseline" else diagnosis.extended
@@ -98,7 +98,7 @@ def _write(diagnosis: "late.Diagnosis", content: dict[str, Any], out: str) -> li
             raise DataError(f"{os.path.join(out, which)}.json: the model cannot be written: {error}.") from error
 
     # All are composed before the first is written.
-    page = late.report_html(diagnosis, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC")
+    page = late.report_html(diagnosis, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", read)
     texts = {_REPORT: page, _JSON: f"{late.finite_json(content)}\n"}
     texts |= {_BASELINE: model("baseline"), _EXTENDED: model("extended")}
     ahead = diagnosis.next_experiment

@@ -263,7 +263,8 @@ def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:
 def _run_view(one: Compared) -> RunView:
     record = one.run.record
     time_s, voltage_V, used = np.asarray(record.time_s), np.asarray(record.voltage_V), one.run.fitted & ~one.held_out
-    return RunView(record.source, time_s, voltage_V, one.run.displacement_um, one.before_um, one.after_um, used)
+    seen = one.run.displacement_um, one.before_um, one.after_um, used
+    return RunView(record.source, time_s, voltage_V, *seen, tuple(record.extra))
 
 
 def _gain(

@@ -125,7 +125,7 @@ class RunView:
     """One run, for pictures: shape `(n,)` each.
 
     `before_um` and `after_um` are measurement less the plain and the extended stage, offset and start taken off;
-    `fitted` are the samples that were used.
+    `fitted` are the samples that were used, and `extra` the names of the further columns.
     """
 
     source: str
@@ -135,6 +135,7 @@ class RunView:
     before_um: np.ndarray
     after_um: np.ndarray
     fitted: np.ndarray
+    extra: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """A diagnosis as one page that needs nothing else: pictures are in it, and it opens without a network."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from jinja2 import Environment
@@ -28,10 +29,10 @@ from fits.report._words import (
 )
 
 
-def report_html(diagnosis: Diagnosis, when: str = "") -> str:
+def report_html(diagnosis: Diagnosis, when: str = "", paths: Sequence[str] = ()) -> str:
     """Write a diagnosis as an HTML page for screen, phone and paper, all in one; the same one gives the same text.
 
-    It says `when` the runs were read, where that is given.
+    It says `when` the runs were read and from which `paths`, in their order, where that is given.
     """
     causes, ahead = diagnosis.causes, diagnosis.next_experiment
     named = [cause.name for cause in causes] or [""]
@@ -63,7 +64,7 @@ def report_html(diagnosis: Diagnosis, when: str = "") -> str:
             kind=KINDS[diagnosis.verdict],
             when=when,
             steps=next_steps(diagnosis),
-            runs=runs_read(diagnosis.runs),
+            runs=runs_read(diagnosis.runs, paths),
             partly=partly_fitted(diagnosis.runs, math.isfinite(diagnosis.gain.heldout_rms_before_um)),
             parameters=stage_parameters(diagnosis),
             tiles=_tiles(diagnosis),

@@ -94,15 +94,29 @@ def _is_own(diagnosis: Diagnosis, name: str) -> bool:
     return form.independent or (form.per_run and alone) or bool(parts and form.strength and not held)
 
 
-def runs_read(runs: Sequence[RunView]) -> list[tuple[str, ...]]:
-    """Name, samples, duration in s, range of the command in V, and use of every run."""
+def runs_read(runs: Sequence[RunView], paths: Sequence[str] = ()) -> list[tuple[str, ...]]:
+    """Name or path, samples, rate, duration in s, range of the command in V, channels and use of every run.
+
+    Paths are those that were given, in the order of the runs.
+    """
     rows: list[tuple[str, ...]] = []
-    for run in runs:
+    for k, run in enumerate(runs):
         share = float(run.fitted.mean()) if run.fitted.size else 0.0
         use = "held out" if share == 0 else "fitted" if share == 1 else f"{percent(share)} fitted"
         span_s, volts = (number(float(np.ptp(one))) if one.size else NONE for one in (run.time_s, run.voltage_V))
-        rows.append((run.source or NONE, f"{run.time_s.size}", span_s, volts, use))
+        name = paths[k] if len(paths) == len(runs) and paths[k].endswith(run.source) else run.source
+        channels = ", ".join(("voltage", "displacement", *(plain(one) for one in run.extra)))
+        rows.append((name or NONE, f"{run.time_s.size}", _rate_Hz(run.time_s), span_s, volts, channels, use))
     return rows
+
+
+def _rate_Hz(time_s: np.ndarray) -> str:
+    """Write the sampling rate in Hz, where there is one."""
+    steps = np.diff(time_s)
+    if not steps.size:
+        return NONE
+    step = float(np.median(steps))
+    return f"{1 / step:.6g}" if np.max(np.abs(steps - step)) < 0.01 * step else f"uneven, about {1 / step:.3g}"
 
 
 def partly_fitted(runs: Sequence[RunView], held_out: bool) -> str:
