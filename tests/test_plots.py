@@ -106,6 +106,31 @@ def test_several_runs_and_an_unknown_start(tmp_path, rng, model, monkeypatch):
     assert np.mean(np.abs(error[:, 1]) < with_noise[:, 1]) > 0.9
 
 
+def test_measurement_and_model_look_the_same_in_all_pictures(tmp_path, rng, model, monkeypatch):
+    """Also in what a fit shows by itself, where the slowest run lies under the model."""
+    styles = []
+
+    def remember_styles(picture, path):
+        lines = [line for axes in picture.axes for line in axes.lines if line.get_label() in ("measured", "model")]
+        styles.extend((line.get_label(), line.get_color()) for line in lines)
+        return path
+
+    monkeypatch.setattr("fits.plots._style.save", remember_styles)
+    slow = record(rng, model, waves(3000, 2))
+    result = result_of(model, [report("run.csv")], rng)
+    fits.plot_fit(result, [slow], tmp_path, holdout=0.3)
+    fast = record(rng, model, waves(200, 2), offset_um=5.0)
+    picture = replace(result, runs=(report("fast.csv", 8.0), report("run.csv")), records=(fast, slow)).plot()
+    remember_styles(picture, None)
+    assert sorted(set(styles)) == [("measured", "0.65"), ("model", "0.0")]
+    assert len(styles) == 6
+    measured = picture.axes[0].lines[0].get_xydata()
+    np.testing.assert_array_equal(measured[:, 0], slow.voltage_V)
+    # In the offset of the first run, as the model is.
+    np.testing.assert_allclose(measured[:, 1], slow.displacement_um + 5.0, atol=1e-9)
+    assert [text.get_text() for text in picture.legends[0].get_texts()] == ["measured", "model"]
+
+
 def test_a_run_that_is_missing_and_a_folder_that_is(tmp_path, rng, model):
     measured = record(rng, model, waves(500, 2))
     result = result_of(model, [report("run.csv")], rng)

@@ -134,6 +134,7 @@ def fit(
         misfit=miss,
         smoothness=float(np.exp(tried.solution.hyper.log_density)),
         trials=tuple(trials),
+        records=tuple(records),
     )
 
 

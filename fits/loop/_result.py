@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from fits.io._given import AnyRuns, program_given
 from fits.io._limits import Ranges, measured_ranges
+from fits.io._record import Record
 from fits.io._summary import AbstractSummary
 from fits.loop._misfit import Misfit
 from fits.loop._prediction import Prediction
@@ -135,7 +136,7 @@ class FitResult(AbstractSummary, Generic[_M]):
     chose, in 1/strokes^2, None without a grid; `trials` are the resolutions that the fit of a hysteresis tried, in
     order. `parameters` are those of a stage outside of the hysteresis' grid, in the order of the solver's
     coordinates, with the correlation between them, shape `(p, p)`; `unseen` are combinations of them that the data
-    leave open, one sentence each.
+    leave open, one sentence each. `records` are those that were fitted.
     """
 
     model: _M
@@ -149,6 +150,7 @@ class FitResult(AbstractSummary, Generic[_M]):
     parameters: tuple[ParameterEstimate, ...] = ()
     correlation: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     unseen: tuple[str, ...] = ()
+    records: tuple[Record, ...] = ()
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for parameter in self.parameters:

@@ -59,9 +59,9 @@ def loops_of(runs: Sequence[Drawn]) -> Figure:
     picture, axes = _columns(runs, style.NARROW_in if len(runs) == 1 else style.WIDE_in)
     for each, (loop, error) in zip(runs, axes.T, strict=False):
         voltage, known = each.run.record.voltage_V, each.run.known
-        # Loops run over each other many times: lines of one kind would hide those of the other.
-        style.curve(loop, voltage, each.predicted_um, "model", color=style.LIGHT, linewidth=1.4)
-        style.dots(loop, voltage, each.run.displacement_um, "measured")
+        # Loops run over each other many times: as lines both would hide each other.
+        style.curve(loop, voltage, each.predicted_um, "model", **style.MODEL)
+        style.dots(loop, voltage, each.run.displacement_um, "measured", style.MEASURED["color"])
         error.axhline(0.0, color=style.LIGHT, linewidth=0.6)
         style.dots(error, voltage[known], each.off_um[known])
         style.label(error, "voltage (V)")
@@ -285,13 +285,13 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
 
     picture, (size, turn) = style.panels(style.WIDE_in, 3.9, 2, 1, sharex=True, height_ratios=(1.4, 1))
     # The less coherent a line, the lighter.
-    shade = 0.85 * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2)
-    grey: dict[str, Any] = {"c": shade, "cmap": "gray", "vmin": 0.0, "vmax": 1.0, "s": 5.0, "linewidths": 0.0}
-    grey["zorder"], name = 3, "measured (Welch: peaks are rounded)"
+    shade = 0.45 + 0.45 * np.minimum(1.0, (1 - measured.coherence) / (1 - _COHERENT) / 2)
+    grey: dict[str, Any] = {"c": shade, "cmap": "gray", "vmin": 0.0, "vmax": 1.0, "s": 8.0, "linewidths": 0.0}
+    name = "measured (Welch: peaks are rounded)"
     size.scatter(measured.frequency_Hz, np.abs(measured.response), label=name, **grey)
-    size.loglog(frequency, np.abs(model), label="driver and mechanics", color="0.5", linewidth=1.2)
+    size.loglog(frequency, np.abs(model), label="driver and mechanics", **style.MODEL)
     turn.scatter(measured.frequency_Hz, np.degrees(near), **grey)
-    turn.semilogx(frequency, np.degrees(phase), color="0.5", linewidth=1.2)
+    turn.semilogx(frequency, np.degrees(phase), **style.MODEL)
     turn.xaxis.set_major_formatter(LogFormatter())
     turn.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
     title = f"{style.verbatim(source)}\nover the displacement that the hysteresis alone would give"

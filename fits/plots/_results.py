@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from fits.control._compensate import gains_of
 from fits.diagnosis._result import Diagnosis
 from fits.io._record import Record, Reference
 from fits.loop._result import FitResult
@@ -18,6 +19,7 @@ from fits.plots import _style as style
 from fits.plots._diagnosis import residual_figure
 from fits.plots._fit import linear_gain
 from fits.plots._machining import budget_bars, tornado
+from fits.stage._checks import speed_Hz
 from microid import Mechanics, Stage
 
 # Ends of the smaller loops inside the largest one, as parts of the range.
@@ -62,14 +64,24 @@ def _(result: Diagnosis) -> Figure:
 
 @picture_of.register(FitResult)
 def _(result: FitResult[Any]) -> Figure:
-    """Loops of the fitted hysteresis, and of a stage the gain of driver and mechanics."""
+    """Loops of the fitted hysteresis over the slowest run, and of a stage the gain of driver and mechanics."""
     law, stage = result.hysteresis, result.model if isinstance(result.model, Stage) else None
     width_in, columns = (style.WIDE_in, 2) if stage else (style.NARROW_in, 1)
     picture, grid = style.panels(width_in, 2.8, 1, columns, squeeze=False)
     low, high = float(law.density.lower_V), float(law.density.upper_V)
     ends = low + (high - low) * np.ravel(_LOOPS)
     voltage = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(ends)])
-    style.curve(grid[0, 0], voltage, np.asarray(eqx.filter_jit(law)(jnp.asarray(voltage))), **style.MODEL)
+    if result.records:
+        slowest = min(range(len(result.records)), key=lambda k: speed_Hz(result.records[k]))
+        record, offset_um = result.records[slowest], result.runs[slowest].offset_um - result.runs[0].offset_um
+        ahead, behind, rest_um = gains_of(stage) if stage else (1.0, 1.0, 0.0)
+        assert record.displacement_um is not None
+        seen_um = (record.displacement_um - offset_um - rest_um) / behind
+        style.curve(grid[0, 0], ahead * record.voltage_V, seen_um, "measured", **style.MEASURED)
+    slow_um = np.asarray(eqx.filter_jit(law)(jnp.asarray(voltage)))
+    style.curve(grid[0, 0], voltage, slow_um, "model", **style.MODEL)
+    if result.records:
+        style.legend(picture, grid[0, :1])
     style.label(grid[0, 0], "voltage (V)", "displacement (µm)", "hysteresis, slowly")
     if stage:
         resonances = [float(part.natural_frequency_Hz) for part in stage.parts if isinstance(part, Mechanics)]

@@ -246,6 +246,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[m.Stage]:
         parameters=estimates(precision.chain, solved.z, sd),
         correlation=covariance / np.maximum(np.outer(sd, sd), 1e-300),
         unseen=unseen,
+        records=tuple(run.record for run in solved.runs),
     )
 
 
