@@ -2,6 +2,7 @@
 
 import functools
 import json
+import re
 import shutil
 import threading
 import urllib.error
@@ -57,12 +58,18 @@ def test_results_stand_side_by_side_for_this_machine_alone(address):
         text = answer.read().decode()
     page = Page(text)
     assert text.count("<iframe") == 2
-    assert text.count("<article>") == 4
+    assert text.count("<article") == 4
     # A model by itself is shown, and that of a diagnosis by its report.
     for words in ("stage.json", "natural_frequency_Hz", "first/report.html", "se & cond/report.html", ABOUT):
         assert words in page.text
     assert "extended.json" not in page.text
-    assert [status_of(address + link) for link in page.links if not link.startswith("data:")] == [200] * 4
+    assert [status_of(address + link) for link in page.links if not link.startswith("data:")] == [200] * 6
+    # Each opens by its name, says when it was written, and words, whose lines are long, have the whole width.
+    for name, place in (("Model stage.json", "stage.json"), ("Sweep sweep", "sweep/about.json")):
+        assert f'<h2><a href="{place}">{name}</a></h2>' in text
+    assert len(re.findall(r"· \d{4}-\d\d-\d\d \d\d:\d\d</p>", text)) == 4
+    assert text.count('<article class="whole">') == text.count('<pre class="words">') == 2
+    assert re.search(r"\.gallery \.whole \{ grid-column: 1 / -1", text)
     assert status_of(address, Host="rebound.example:80") == 404
     for inside in ("first/", "sweep/ledger", "../secret", "%2e%2e/secret"):
         assert status_of(address + inside) == 404

@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
@@ -24,11 +25,15 @@ _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 
 @dataclass(frozen=True)
 class Shown:
-    """A page or a result without one: its title, where it is, its address below the folder, and else its words."""
+    """A page or a result without one: its title, where it is, its address below the folder, when it was written.
+
+    A result without a page has its words.
+    """
 
     title: str
     place: str
     page: str
+    when: str
     words: str = ""
 
 
@@ -42,16 +47,32 @@ def _found(folder: Path) -> Iterator[Shown]:
         here, within = Path(at), Path(at).relative_to(folder)
         inner[:] = sorted(name for name in inner if name != LEDGER and not name.endswith(".zarr") and name[0] != ".")
         if ABOUT in names and LEDGER in os.listdir(here):
-            yield Shown("Sweep", str(within), "", _words(here))
+            yield Shown(
+                f"Sweep {here.resolve().name}",
+                str(within),
+                _address(within / ABOUT),
+                _when(here / ABOUT),
+                _words(here),
+            )
         for name in sorted(names):
             path, place, start = here / name, str(within / name), ""
             if name.endswith((".html", ".json")):
                 start = path.read_text(encoding="utf-8", errors="replace")[:_START]
             if name.endswith(".html"):
                 title = _TITLE.search(start)
-                yield Shown(html.unescape(title[1]) if title else name, place, quote((within / name).as_posix()))
+                words = html.unescape(title[1]) if title else name
+                yield Shown(words, place, _address(within / name), _when(path))
             elif _MODEL in start[:200] and not (name in _OF_DIAGNOSIS and "diagnosis.json" in names):
-                yield Shown("Model", place, "", _words(path))
+                yield Shown(f"Model {name}", place, _address(within / name), _when(path), _words(path))
+
+
+def _address(place: Path) -> str:
+    return quote(place.as_posix())
+
+
+def _when(path: Path) -> str:
+    """When a file was written last, in local time."""
+    return f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d %H:%M}"
 
 
 def _words(path: Path) -> str:
