@@ -191,3 +191,11 @@ def test_a_unit_that_is_guessed_is_said_to_be(tmp_path):
         path.write_text(f"time_s,voltage_V,{name}{unit}\n" + rows(time_s, voltage_V, 500 * displacement_um))
         told = " ".join(json.loads(run("inspect", path, "--json").stdout)["remarks"])
         assert (f"column '{name}' states no unit, and [nm] is guessed" in told) == guessed
+
+
+@pytest.mark.parametrize("command", ["fit", "inspect", "sensitivity"])
+def test_a_format_of_no_pictures_is_refused(command, tmp_path):
+    (tmp_path / "run.csv").write_text("time_s,voltage_V,displacement_um\n0,0,0\n")
+    given = {"fit": [tmp_path / "run.csv", "--out", tmp_path / "m.json"], "inspect": [tmp_path / "run.csv"]}
+    refused(run(command, *given.get(command, []), "--format", "svg"), "--format", "--plots")
+    assert files(tmp_path) == ["run.csv"]

@@ -171,3 +171,18 @@ def test_labels_move_apart_by_no_more_than_they_must(rng):
     # The mean of labels that push each other stays; those far from all others do not move.
     assert found.mean() == pytest.approx(wanted.mean())
     np.testing.assert_allclose(_spaced(10 * np.arange(4.0), 0.5), 10 * np.arange(4.0))
+
+
+def test_a_panel_by_itself_has_no_letter_and_no_room_for_words_that_are_not_there(tmp_path, monkeypatch):
+    design = other()
+    _, (_, several) = draw(design, ("alpha", "z"), tmp_path)
+    assert [axes.get_title(loc="left")[:4] for axes in panels(several)] == ["(a) ", "(b) "]
+    monkeypatch.setattr(fits.plots._machining, "paper_claims", lambda _: ())
+    figures = []
+    monkeypatch.setattr("fits.plots._style.save", lambda picture, path: figures.append(picture) or path)
+    fits.plot_sensitivity(design, fits.sensitivities(design, ("x",)), tmp_path)
+    (alone,) = panels(figures[1])
+    assert alone.get_title(loc="left").startswith("x: full stroke")
+    figures[1].draw_without_rendering()
+    # In inches from the foot to the letters of the axis.
+    assert alone.get_tightbbox().y0 / figures[1].dpi < 0.25

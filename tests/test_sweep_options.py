@@ -223,6 +223,17 @@ def test_heat_maps_have_a_cell_around_each_value(values, logarithmic):
     assert np.histogram(np.repeat(shown, 3), _edges(shown))[0].tolist() == [3] * len(values)
 
 
+@pytest.mark.parametrize("values", [[10.0, 20.0, 40.0, 60.0], [1.0, 10.0, 100.0]])
+def test_few_values_of_a_heat_map_have_their_ticks(values):
+    """Cells reach from 5 to 70 for 10 to 60, which is nowhere else to be seen."""
+    swept = {"program.amplitude_V": np.repeat(values, 2), "mechanics.gain": np.tile([1.0, 2.0], len(values))}
+    heat, _ = _heat(_Rows(swept, {}, "width_pct", np.arange(2.0 * len(values))), tuple(swept)).axes
+    assert heat.get_xticks().tolist() == values
+    assert [text.get_text() for text in heat.get_xticklabels()] == [f"{value:g}" for value in values]
+    assert heat.get_yticks().tolist() == [1.0, 2.0]
+    assert heat.get_xticks(minor=True).size == 0
+
+
 def test_rows_that_failed_are_drawn_as_such_and_names_whole():
     swept = {"mechanics.gain": np.repeat([1.0, 2.0], 4), "program.shape": np.tile([0, 1, 0, 1], 2)}
     values = np.array([np.nan, 2.0, 3.0, 5.0, 6.0, 7.0, np.nan, 9.0])

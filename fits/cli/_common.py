@@ -18,6 +18,7 @@ from types import FrameType, SimpleNamespace
 from typing import Any, NoReturn
 
 import click
+from click.core import ParameterSource
 
 from fits.cli import _late as late
 from fits.io._errors import DataError, without_middle
@@ -127,6 +128,13 @@ def _logged(verbose: bool) -> Iterator[None]:
         _LOG.removeHandler(handler)
 
 
+def _refuse_idle_format(options: dict[str, Any]) -> None:
+    """Refuse a format of pictures that are not asked for."""
+    stated = click.get_current_context().get_parameter_source("form") is ParameterSource.COMMANDLINE
+    if stated and options.get("plots", "") is None:
+        raise DataError("--format: expected --plots with it, the folder for the pictures; give one, or leave it out.")
+
+
 def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     """Hand a command its options in one piece; bad input and interruption end in one line on stderr and a status.
 
@@ -139,6 +147,7 @@ def in_sentences(command: Callable[[Given], None]) -> Callable[..., None]:
     def run(verbose: bool = False, **options: Any) -> None:
         try:
             with _logged(verbose):
+                _refuse_idle_format(options)
                 command(Given(**options))
         except KeyboardInterrupt as stop:
             stopped(stop, NOTHING_LEFT)

@@ -138,7 +138,8 @@ def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[
     lines = [_claim_lines(panel, claims) for panel in panels]
     heights = []
     for k in range(0, len(panels), columns):
-        heights += [2.3, _LINE_in * max(1, *map(len, lines[k : k + columns]))]
+        # Where the paper says nothing there is nothing below.
+        heights += [2.3, max(0.01, _LINE_in * max(map(len, lines[k : k + columns])))]
     width_in = WIDE_in * (1 if columns > 1 else 0.55)
     picture = figure(width_in, sum(heights) + 0.55 * len(heights) / 2 + 0.25, gap=0.06)
     grid = picture.add_gridspec(len(heights), columns, height_ratios=heights)
@@ -147,7 +148,8 @@ def _machining_error(design: Design, panels: Sequence[_Panel], claims: Sequence[
         axes = picture.add_subplot(grid[2 * row, column])
         _draw_curves(axes, design, panel)
         stroke = f"{plain(panel.axis.stroke)} {UNIT_SIGNS[panel.axis.output_unit]}"
-        label(axes, title=f"({'abcdef'[k]}) {panel.title}: full stroke {stroke}", size_pt=8)
+        letter = f"({'abcdef'[k]}) " if len(panels) > 1 else ""
+        label(axes, title=f"{letter}{panel.title}: full stroke {stroke}", size_pt=8)
         below = picture.add_subplot(grid[2 * row + 1, column])
         below.set_axis_off()
         for number, (words, color) in enumerate(lines[k]):

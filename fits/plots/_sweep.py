@@ -138,6 +138,10 @@ def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
     for axis, name in zip((axes.xaxis, axes.yaxis), pair, strict=True):
         if name in rows.words:
             axis.set_ticks(range(len(rows.words[name])), [verbatim(word, 24) for word in rows.words[name]])
+        elif len(few := np.unique(rows.swept[name])) <= _MOST_TICKS:
+            # Cells reach beyond their values.
+            axis.set_ticks(few, [f"{value:.3g}" for value in few])
+            axis.set_ticks([], minor=True)
     return picture
 
 
