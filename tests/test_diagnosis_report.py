@@ -258,3 +258,32 @@ def test_numbers_have_sensible_digits():
     ]
     assert named == ["onset", "a"]
     assert [shown_unit(u) for u in ("1", "um", "um/K", "1/K", "um/V^2")] == ["", "µm", "µm/K", "1/K", "µm/V²"]
+
+
+@pytest.mark.parametrize(("form", "mains_Hz"), [("50_Hz", 50), ("60_Hz", 60)])
+def test_a_hum_is_told_by_the_amplitudes_of_its_lines(rng, form, mains_Hz):
+    """Against amplitudes of many draws of its cosines and sines, which only JSON has."""
+    values, sd = rng.normal(0, 0.1, (2, 2, 3)), rng.uniform(1e-4, 2e-3, (2, 2, 3))
+    parameters = [
+        ParameterEstimate(f"{field}[{h}] in run {run + 1}", "um", values[run, k, h], sd[run, k, h], -1.0, 1.0)
+        for run in range(2)
+        for k, field in enumerate(("cosine_um", "sine_um"))
+        for h in range(3)
+    ]
+    frequency = ParameterEstimate("frequency_Hz", "Hz", mains_Hz + 0.01, 0.001, 49.0, 61.0)
+    found = diagnosis(rng)
+    hum = replace(found.causes[0], name="mains_hum", form=form, parameters=(*parameters, frequency))
+    found = replace(found, causes=(hum,))
+    assert [one.name for one in hum.shown] == [
+        *(f"amplitude at {h * mains_Hz} Hz in run {run}" for run in (1, 2) for h in (1, 2, 3)),
+        "frequency_Hz",
+    ]
+    drawn = np.hypot(*np.moveaxis(values + sd * rng.standard_normal((20_000, 2, 2, 3)), 2, 0))
+    np.testing.assert_allclose([one.value for one in hum.shown[:-1]], drawn.mean(0).ravel(), rtol=0.05)
+    # Where the line is seen; below its noise an amplitude is no Gaussian.
+    for one, spread_um, size_um in zip(hum.shown, drawn.std(0).ravel(), drawn.mean(0).ravel(), strict=False):
+        assert one.sd == pytest.approx(spread_um, rel=0.1) or size_um < 5 * spread_um
+    for text in (found.summary(), report_html(found)):
+        assert "cosine" not in text
+        assert f"amplitude at {mains_Hz}" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert "cosine_um[0] in run 1" in diagnosis_json(found)["causes"][0]["parameters"]

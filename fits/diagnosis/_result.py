@@ -2,6 +2,7 @@
 
 import enum
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
@@ -14,8 +15,9 @@ from fits.io._summary import AbstractSummary
 from fits.loop._report_words import UNSEEN, is_seen
 from fits.loop._result import ParameterEstimate
 from fits.stage._uncertainty import StageUncertainty
+from fits.stats._metrics import TWO_SIDED_95
 from microid import Stage
-from microid.effects import card_of
+from microid.effects import EFFECTS, card_of
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
@@ -60,6 +62,36 @@ class FoundCause:
     fingerprint: str
     experiment: str
     source: str
+
+    @property
+    def shown(self) -> tuple[ParameterEstimate, ...]:
+        """The parameters as people read them: of lines the amplitudes, for their cosines and sines."""
+        card = next((one for one in EFFECTS if (one.name, one.form) == (self.name, self.form)), card_of(self.name))
+        if not card.phases:
+            return self.parameters
+        cosine, sine = card.phases
+        known, out = {one.name: one for one in self.parameters}, list[ParameterEstimate]()
+        for one in self.parameters:
+            field, index, where = _ENTRY.fullmatch(one.name).groups()  # type: ignore[union-attr]
+            if field == cosine:
+                line = f"amplitude at {card.lines_Hz[int(index or 0)]:g} Hz{where}"
+                out.append(_amplitude(line, one, known[one.name.replace(cosine, sine, 1)]))
+            elif field != sine:
+                out.append(one)
+        return tuple(out)
+
+
+# A field, the place of an entry in it, and of which run it is.
+_ENTRY = re.compile(r"(\w+)(?:\[(\d+)\])?(.*)")
+
+
+def _amplitude(name: str, cosine: ParameterEstimate, sine: ParameterEstimate) -> ParameterEstimate:
+    """Amplitude of a line, with the standard deviation along it; that of no line is the larger of the two."""
+    size = math.hypot(cosine.value, sine.value)
+    sd = math.hypot(cosine.value * cosine.sd, sine.value * sine.sd) / size if size > 0 else max(cosine.sd, sine.sd)
+    return ParameterEstimate(
+        name, cosine.unit, size, sd, max(size - TWO_SIDED_95 * sd, 0.0), size + TWO_SIDED_95 * sd
+    )
 
 
 @dataclass(frozen=True)
@@ -205,7 +237,7 @@ class Diagnosis(AbstractSummary):
             whole = "noise" if card_of(cause.name).statistic else "misfit"
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
                 lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the {whole}")
-            for each in cause.parameters:
+            for each in cause.shown:
                 if not is_seen(each.value, each.lower, each.upper):
                     lines.append(f"    {each.name:24} {UNSEEN}")
                     continue

@@ -109,6 +109,9 @@ class AbstractEffect(AbstractPart):
     lines_Hz, tolerance
         Frequencies of the lines whose amplitudes are the entries of its strengths, and the part by which those may be
         off: samples may turn a line into a drift.
+    phases
+        Names of two strengths that are the cosines and the sines of these lines, of which amplitudes are shown. Empty
+        for an effect that is shown by its strengths.
     fingerprint
         What it leaves in the residual of the plain stage, one sentence.
     confusions
@@ -161,6 +164,7 @@ class AbstractEffect(AbstractPart):
     counted: ClassVar[tuple[str, ...]] = ()
     lines_Hz: ClassVar[tuple[float, ...]] = ()
     tolerance: ClassVar[float] = 0.0
+    phases: ClassVar[tuple[str, ...]] = ()
     view: ClassVar[View] = "voltage"
     column: ClassVar[str] = ""
     statistic: ClassVar[Statistic] = ""

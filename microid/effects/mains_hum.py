@@ -42,6 +42,7 @@ class MainsHum(AbstractEffect):
     repeats: ClassVar[bool] = True
     lines_Hz: ClassVar[tuple[float, ...]] = (50.0, 100.0, 150.0)
     tolerance: ClassVar[float] = _TOLERANCE
+    phases: ClassVar[tuple[str, ...]] = ("cosine_um", "sine_um")
     fingerprint: ClassVar[str] = (
         "Lines in the spectrum at multiples of 50 or 60 Hz, also at rest, whatever the command."
     )
@@ -91,6 +92,7 @@ class MainsHum60(AbstractEffect):
     repeats: ClassVar[bool] = True
     lines_Hz: ClassVar[tuple[float, ...]] = (60.0, 120.0, 180.0)
     tolerance: ClassVar[float] = _TOLERANCE
+    phases: ClassVar[tuple[str, ...]] = ("cosine_um", "sine_um")
     fingerprint: ClassVar[str] = MainsHum.fingerprint
     confusions: ClassVar[tuple[str, ...]] = MainsHum.confusions
     experiment: ClassVar[str] = MainsHum.experiment
