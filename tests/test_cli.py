@@ -119,7 +119,9 @@ def test_json_and_info_agree(bench, tmp_path):
     info = json.loads(run("info", out, "--json").stdout)
     assert info["model"] == "Preisach"
     assert info["fit"] == report
-    assert {"path": "density.packed_um", "shape": [36], "unit": "um"} in info["parameters"]
+    packed = json.loads(out.read_text())["model"]["density"]["packed_um"]["value"]
+    ends = {"lowest": min(packed), "highest": max(packed)}
+    assert {"path": "density.packed_um", "shape": [36], "unit": "um", **ends} in info["parameters"]
 
     measured = columns_of(folder / "csv" / "heldout.csv")["displacement_um"]
     assert report["held_out"]["range_um"] == np.ptp(measured)
@@ -129,6 +131,8 @@ def test_json_and_info_agree(bench, tmp_path):
     words = run("info", out)
     assert words.exit_code == 0
     assert fit.stdout.split("\n\nmodel ")[0] in words.stdout
+    assert "\nfitted to train.csv; heldout.csv only predicted\n" in words.stdout
+    assert f"36 numbers from {min(packed):.4g} to {max(packed):.4g} um\n" in words.stdout
 
 
 def test_info_does_not_wait_for_jax(bench):

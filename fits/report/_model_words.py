@@ -9,13 +9,15 @@ from fits.loop._report_words import describe, parameter_lines
 
 
 def model_numbers(part: Any, path: str = "") -> Iterator[dict[str, Any]]:
-    """Every field that holds numbers: its path, shape and unit, and the value of a single one."""
+    """Every field that holds numbers: its path, shape and unit, and its value, or the range of many."""
     if isinstance(part, dict) and "unit" in part:
         shape, value = [], part.get("value")
         while isinstance(value, list):
             shape.append(len(value))
             value = value[0] if value else None
-        one = {"value": value} if not shape and isinstance(value, int | float) and abs(value) < 1e300 else {}
+        many = _flat(part.get("value")) if shape else []
+        one: dict[str, Any] = {"lowest": min(many), "highest": max(many)} if many else {}
+        one |= {"value": value} if not shape and isinstance(value, int | float) and abs(value) < 1e300 else {}
         yield {"path": path, "shape": part.get("shape", shape), "unit": str(part["unit"]), **one}
     elif isinstance(part, dict) and isinstance(part.get("parts"), list) and isinstance(part.get("names"), list):
         for name, inner in zip(part["names"], part["parts"], strict=False):
@@ -24,6 +26,14 @@ def model_numbers(part: Any, path: str = "") -> Iterator[dict[str, Any]]:
         for name, inner in part.items() if isinstance(part, dict) else enumerate(part):
             step = f"{path}.{name}".lstrip(".") if isinstance(part, dict) else f"{path}[{name}]"
             yield from model_numbers(inner, step)
+
+
+def _flat(value: Any) -> list[float]:
+    """The numbers of an array; none where it holds anything else, or what has no finite size."""
+    if isinstance(value, list):
+        parts = [_flat(one) for one in value]
+        return [one for part in parts for one in part] if all(parts) else []
+    return [value] if isinstance(value, int | float) and abs(value) < 1e300 else []
 
 
 def model_kind(path: str, held: dict[str, Any]) -> str:
@@ -42,6 +52,8 @@ def model_words(path: str, held: dict[str, Any]) -> str:
         unit = "" if row["unit"] == "1" else row["unit"]
         size = "x".join(map(str, row["shape"])) if prod(row["shape"]) else "no"
         shown = f"{row['value']:.6g} {unit}" if "value" in row else f"{size} numbers {unit and f'in {unit}'}"
+        if "lowest" in row:
+            shown = f"{size} numbers from {row['lowest']:.4g} to {row['highest']:.4g} {unit}"
         lines.append(f"  {row['path']:{width}}  {shown}".rstrip())
     return "\n".join([*lines, "", _known_of_fit(path, held)])
 
@@ -55,7 +67,15 @@ def _known_of_fit(path: str, held: dict[str, Any]) -> str:
             rows = parameter_lines(held["fit"].get("parameters", ()))
             seen = f" from {', '.join(held['fit']['sources'])}" if held["fit"].get("sources") else ""
             return "\n".join([f"written by 'microid diagnose'{seen}, whose report says how well it predicts", *rows])
-        return describe(held["fit"])
+        return f"{_fitted_to(held['fit']['runs'])}\n\n{describe(held['fit'])}"
     except (LookupError, TypeError, ValueError, AttributeError):
         # The format does not say what a report holds, and the words are made for that of a fit.
         raise DataError(f"{path}: its report is not that of a fit; fit again, or add --json to see it.") from None
+
+
+def _fitted_to(runs: list[dict[str, Any]]) -> str:
+    """Which runs the model is of, and which were only predicted."""
+    fitted = [run["source"] or "a run without a name" for run in runs if run["in_sample"]]
+    aside = [run["source"] or "a run without a name" for run in runs if not run["in_sample"]]
+    only = f"; {', '.join(aside)} only predicted" if aside else ""
+    return f"fitted to {', '.join(fitted)}{only}"
