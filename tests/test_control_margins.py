@@ -95,6 +95,9 @@ def test_gain_margin_is_the_factor_at_which_a_pole_leaves_the_unit_circle(rng):
         assert closed_radius(loop, factor) == pytest.approx(1, abs=1e-6)
         assert all(closed_radius(loop, f) < 1 for f in np.linspace(1, factor * (1 - 1e-6), 40))
         assert closed_radius(loop, factor * 1.001) > 1
+        # At that frequency the loop gain is real and negative.
+        there = response(loop, float(found.gain_margin_Hz))
+        assert there == pytest.approx(-1 / factor, rel=1e-5)
 
 
 def test_phase_margin_and_sensitivity_are_those_of_a_dense_grid(rng):
@@ -105,6 +108,8 @@ def test_phase_margin_and_sensitivity_are_those_of_a_dense_grid(rng):
         crossed = np.flatnonzero(np.diff(np.sign(np.abs(gain) - 1)))
         angle = np.abs(np.angle(-gain[crossed], deg=True))
         assert float(found.phase_margin_deg) == pytest.approx(angle.min(), abs=0.05)
+        there = response(polynomials(*numbers), float(found.phase_margin_Hz))
+        assert (abs(there), abs(np.angle(-there, deg=True))) == pytest.approx((1, angle.min()), rel=1e-3, abs=0.05)
         assert float(found.crossover_Hz) == pytest.approx(frequency[crossed[-1]], rel=1e-3, abs=2e-3)
         sensitivity = 1 / np.abs(1 + gain)
         assert float(found.sensitivity_peak) == pytest.approx(sensitivity.max(), rel=1e-5)

@@ -16,8 +16,10 @@ import microid
 from fits import DataError, FitResult, FitStatus, LevelTrial, Record, RunReport, Uncertainty
 from fits.io._summary import AbstractSummary
 from fits.loop._design import Grid
+from fits.plots._fit import _response, linear_gain
 from fits.plots._results import picture_of
 from fits.plots._style import legend, thinned
+from fits.stage._start import MeasuredResponse
 
 LOWER_V, UPPER_V, LEVELS = 0.0, 100.0, 9
 
@@ -129,6 +131,12 @@ def test_measurement_and_model_look_the_same_in_all_pictures(tmp_path, rng, mode
     # In the offset of the first run, as the model is.
     np.testing.assert_allclose(measured[:, 1], slow.displacement_um + 5.0, atol=1e-9)
     assert [text.get_text() for text in picture.legends[0].get_texts()] == ["measured", "model"]
+    lines_Hz = np.linspace(10, 200, 9)
+    seen = MeasuredResponse(lines_Hz, linear_gain(fits.default_stage(), lines_Hz), np.full(9, 0.99))
+    for axes in _response(fits.default_stage(), "fast.csv", seen).axes:
+        assert (axes.lines[0].get_color(), axes.lines[0].get_linewidth()) == ("0.0", 0.5)
+        (shades,) = {tuple(row) for row in axes.collections[0].to_rgba(axes.collections[0].get_array())}
+        assert 0.4 < shades[0] < 0.7
 
 
 def test_a_run_that_is_missing_and_a_folder_that_is(tmp_path, rng, model):

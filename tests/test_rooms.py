@@ -78,7 +78,7 @@ def test_rooms_are_what_the_folder_shows():
 
 # What only the command calls, or reads for it, and how files are read.
 OF_THE_COMMAND = {
-    *("fits/report/_model_words.py", "fits/report/_next_steps.py"),
+    *("fits/report/_control.py", "fits/report/_model_words.py", "fits/report/_next_steps.py"),
     *("fits/control/_gains.py", "fits/control/_tune_problem.py", "fits/io/_in_python.py", "fits/io/_inspect.py"),
     *("fits/io/_limits.py", "fits/io/_read_csv.py", "fits/io/_table.py", "fits/io/_text_table.py"),
     "fits/io/_units.py",
