@@ -13,10 +13,7 @@ import numpy as np
 import pytest
 from _command import OFF, columns_of, files, refused, run, without_jax
 
-from fits.cli._main import cli
 from fits.io._jax_setup import _cache_folder
-from fits.loop._plain import INITIAL_STATES
-from microid.densities import FAMILIES
 
 ROOT = Path(__file__).parents[1]
 
@@ -223,14 +220,6 @@ def test_synth_refuses_unknown_scenarios_and_places(tmp_path):
     assert sorted(seeded["files"]) == [
         str(tmp_path / "q" / name) for name in ("heldout.csv", "train.csv", "truth.json")
     ]
-
-
-def test_choices_in_the_help_are_those_of_the_library():
-    options = {option.name: option for option in cli.commands["fit"].params}
-    assert tuple(options["initial"].type.choices) == INITIAL_STATES
-    for family in FAMILIES:
-        assert family in options["family"].help
-    assert run("simulate", "m", "p", "--out", "o", "--initial", "unknown").exit_code == 2
 
 
 def test_version():

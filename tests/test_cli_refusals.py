@@ -8,7 +8,9 @@ from _docs import commands, options_of
 from test_foreign_files import rows, signals
 
 from fits import FitError, FitStatus, read_table
+from fits.cli._main import cli
 from fits.io._units import parse_columns
+from fits.loop._plain import INITIAL_STATES
 from microid.densities import FAMILIES
 
 
@@ -199,3 +201,11 @@ def test_a_format_of_no_pictures_is_refused(command, tmp_path):
     given = {"fit": [tmp_path / "run.csv", "--out", tmp_path / "m.json"], "inspect": [tmp_path / "run.csv"]}
     refused(run(command, *given.get(command, []), "--format", "svg"), "--format", "--plots")
     assert files(tmp_path) == ["run.csv"]
+
+
+def test_choices_in_the_help_are_those_of_the_library():
+    options = {option.name: option for option in cli.commands["fit"].params}
+    assert tuple(options["initial"].type.choices) == INITIAL_STATES
+    for family in FAMILIES:
+        assert family in options["family"].help
+    assert run("simulate", "m", "p", "--out", "o", "--initial", "unknown").exit_code == 2

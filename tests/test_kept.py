@@ -1,4 +1,4 @@
-"""Programs that the command keeps: they answer as those that are compiled anew, and never for something else."""
+"""Programs that the command keeps: they answer as those that are traced anew, and never for something else."""
 
 import os
 import shutil
@@ -30,13 +30,13 @@ def folder(tmp_path):
 
 @pytest.fixture
 def again(folder, tmp_path, monkeypatch):
-    """Call a function as another process would: from the files alone, and without compiling."""
+    """Call a function as another process would: from the files alone, and without tracing."""
 
     def call(function, *args, **options):
         shutil.copytree(folder, tmp_path / "copy")
         keep_in(tmp_path / "copy")
         with monkeypatch.context() as patched:
-            patched.setattr(_kept, "_compiled", lambda *args: pytest.fail("compiled again"))
+            patched.setattr(_kept, "_traced", lambda *args: pytest.fail("traced again"))
             return function(*args, **options)
 
     return call

@@ -1,16 +1,16 @@
-"""Programs that are kept between calls of the command: to compile a stage takes longer than what it does."""
+"""Programs that are kept between calls of the command: tracing a stage takes longer than to compute what it does."""
 
 import functools
 import hashlib
 import io
 import os
 import pickle
-import platform
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,8 +18,9 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-from jax.experimental.compilation_cache.compilation_cache import reset_cache
-from jax.experimental.serialize_executable import deserialize_and_load, serialize
+import jax.export
+import jax.numpy as jnp
+import numpy as np
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -58,7 +59,7 @@ def keep_in(folder: Path | None) -> None:
 
 
 def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Compile a function as `equinox.filter_jit` does, and where programs are kept, in the first call only.
+    """Compile a function as `equinox.filter_jit` does, and where programs are kept, trace it in the first call only.
 
     Programs are told apart by the name of the function, all that is no array, the shapes of arrays, versions,
     settings, and every line of this package: of a function or class of another nothing is kept.
@@ -99,25 +100,31 @@ def _opened(
     found = _read(folder / name)
     if found is None:
         try:
-            found = _compiled(function, arrays, static)
+            found = _traced(function, arrays, static)
         except (ValueError, NotImplementedError):
-            # What calls back into Python cannot be written.
+            # What calls back into Python cannot be exported.
             return None
         _write(folder / name, found)
-    (written, taken, returned), places, rest = found
-    # One device, so that what takes the result is compiled once.
-    program = deserialize_and_load(written, taken, returned, execution_devices=jax.devices()[:1])
+    exported, places, rest = found
     form = jax.tree.structure(places)
+
+    def program(*leaves: Any) -> Any:
+        return exported.call(*leaves)
+
+    program.__name__ = function.__name__
+    compiled = jax.jit(program)
 
     def call(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
-        return eqx.combine(jax.tree.unflatten(form, program(*leaves)), rest)
+        # Their values alone: they come bound to a device, for which others would be compiled once more.
+        values = [jnp.asarray(np.asarray(value)) for value in compiled(*leaves)]
+        return eqx.combine(jax.tree.unflatten(form, values), rest)
 
     return call
 
 
-def _compiled(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any, Any, Any]:
-    """A compiled program as it is written, the places of the arrays that it gives, and what else it gives."""
+def _traced(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any, Any, Any]:
+    """A program, the places of the arrays that it gives, and what else it gives."""
     leaves, form = jax.tree.flatten(arrays)
     given: list[Any] = []
 
@@ -128,24 +135,9 @@ def _compiled(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[A
         given[:] = jax.tree.unflatten(structure, range(len(values))), rest
         return values
 
-    flat.__name__ = function.__name__
-    lowered = jax.jit(flat).lower(*leaves)
-    with _without_cache():
-        program = lowered.compile()
-    return serialize(program), *given
-
-
-@contextmanager
-def _without_cache() -> Iterator[None]:
-    """Compile anew: what JAX's own cache has read from the disk cannot be written again."""
-    before = jax.config.values["jax_enable_compilation_cache"]
-    jax.config.update("jax_enable_compilation_cache", False)
-    reset_cache()
-    try:
-        yield
-    finally:
-        jax.config.update("jax_enable_compilation_cache", before)
-        reset_cache()
+    exported = jax.export.export(jax.jit(flat))(*leaves)
+    # Nobody differentiates it, and the function that would cannot be written.
+    return replace(exported, _get_vjp=None), *given
 
 
 def _read(file: Path) -> tuple[Any, Any, Any] | None:
@@ -187,19 +179,10 @@ def _remove_unused(folder: Path) -> None:
                 file.unlink()
 
 
-def _machine() -> list[str]:
-    """What a processor can do, as far as the system says: what is compiled for one may fail on another."""
-    with suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        told = {line for line in lines if line.startswith(("flags", "Features", "model name"))}
-        return [platform.machine(), *sorted(told)]
-    return [platform.machine(), platform.processor()]
-
-
 @functools.cache
 def _circumstances() -> bytes:
-    """All that decides what is compiled beside the arguments: versions, settings, machine, every line of ours."""
-    stated = [sys.version, jax.default_backend(), str(jax.config.read("jax_enable_x64")), *_machine()]
+    """All that decides what is traced beside the arguments: versions, settings, and each line of this package."""
+    stated = [sys.version, jax.default_backend(), str(jax.config.read("jax_enable_x64"))]
     stated += [f"{name} {version(name)}" for name in _OTHERS]
     stated += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(("JAX_", "EQX_"))]
     lines = hashlib.sha256("\n".join(stated).encode())
