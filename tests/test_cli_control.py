@@ -264,10 +264,10 @@ def test_inputs_are_not_overwritten(folder):
 
 
 def test_gains_are_not_overwritten_either(folder, tmp_path):
-    (tmp_path / "pid.json").write_text('{"proportional_V_per_um": 1, "integral_V_per_um_s": 1}')
-    places = ["control", folder / "linear.json", folder / "step.csv", "--gains", tmp_path / "pid.json"]
-    refused(run(*places, "--out", tmp_path / "pid.json"), "overwrite")
-    assert "proportional" in (tmp_path / "pid.json").read_text()
+    (tmp_path / "pid.txt").write_text('{"proportional_V_per_um": 1, "integral_V_per_um_s": 1}')
+    places = ["control", folder / "linear.json", folder / "step.csv", "--gains", tmp_path / "pid.txt"]
+    refused(run(*places, "--out", tmp_path / "pid.txt"), "overwrite")
+    assert "proportional" in (tmp_path / "pid.txt").read_text()
 
 
 @pytest.mark.parametrize(

@@ -130,8 +130,9 @@ def _logged(verbose: bool) -> Iterator[None]:
 
 def _refuse_idle_format(options: dict[str, Any]) -> None:
     """Refuse a format of pictures that are not asked for."""
-    stated = click.get_current_context().get_parameter_source("form") is ParameterSource.COMMANDLINE
-    if stated and options.get("plots", "") is None:
+    if options.get("plots", "") is not None:
+        return
+    if click.get_current_context().get_parameter_source("form") is ParameterSource.COMMANDLINE:
         raise DataError("--format: expected --plots with it, the folder for the pictures; give one, or leave it out.")
 
 

@@ -4,10 +4,6 @@ import math
 
 import numpy as np
 
-# Heat takes about so long through a millimetre of ceramic (d^2 / (pi^2 a), of a thermal diffusivity a of 0.5 mm^2/s):
-# no stack follows it sooner.
-_SOONEST_s = 0.2
-
 
 def _decades(first: float, last: float, per_decade: float = 1.0) -> list[float]:
     """Values evenly spaced on a logarithmic scale, from the first up to the last at most; the first in any case."""

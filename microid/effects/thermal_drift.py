@@ -11,7 +11,11 @@ from microid._linear import Times
 from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, View, _lowpass, _times_of, register
-from microid.effects._grids import _decades, _SOONEST_s
+from microid.effects._grids import _decades
+
+# Heat takes about so long through a millimetre of ceramic (d^2 / (pi^2 a), of a thermal diffusivity a of 0.5 mm^2/s):
+# no stack follows it sooner.
+_SOONEST_s = 0.2
 
 
 @register
