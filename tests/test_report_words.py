@@ -311,8 +311,12 @@ def test_a_parameter_at_its_bound_that_nothing_shows_gets_no_numbers(rng):
     """A time constant of nothing is seen where the interval is short, and not where it may be anything."""
     open_end = ParameterEstimate("driver.time_constant_s", "s", 2e-9, 5.7, 1e-9, 22.4)
     short = replace(open_end, sd=1e-6, upper=2e-6)
-    at_zero = replace(open_end, value=0.0, lower=0.0)
-    for one, seen in ((open_end, False), (short, True), (at_zero, True), (replace(open_end, value=1.0), True)):
+    at_zero, onset = (
+        replace(open_end, value=0.0, lower=0.0),
+        replace(open_end, value=0.01 + 1e-12, lower=0.01, upper=0.015),
+    )
+    free = replace(open_end, value=1.0)
+    for one, seen in ((open_end, False), (short, True), (at_zero, True), (onset, True), (free, True)):
         (line,) = parameter_lines([vars(one)])
         assert (UNSEEN in line) != seen
         assert (UNSEEN in estimate(one)) != seen

@@ -114,8 +114,13 @@ UNSEEN = "not seen in these runs"
 
 
 def is_seen(value: float | None, lower: float | None, upper: float | None) -> bool:
-    """Whether runs show a parameter: not one at a bound whose 95 % interval is open on the other side."""
+    """Whether runs show a parameter: not one at a bound whose 95 % interval is open on the other side.
+
+    An interval of less than a decade says where it is.
+    """
     if value is None or lower is None or upper is None or not lower < value < upper < inf:
+        return True
+    if 0 < lower and upper < 10 * lower:
         return True
     return min(value - lower, upper - value) >= _AT_BOUND * (upper - lower)
 
