@@ -120,7 +120,7 @@ def is_seen(value: float | None, lower: float | None, upper: float | None) -> bo
     """
     if value is None or lower is None or upper is None or not lower < value < upper < inf:
         return True
-    if 0 < lower and upper < 10 * lower:
+    if lower > 0 and upper < 10 * lower:
         return True
     return min(value - lower, upper - value) >= _AT_BOUND * (upper - lower)
 
