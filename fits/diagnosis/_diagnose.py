@@ -40,7 +40,7 @@ _UNKNOWN = (
 )
 _UNSEEN = (
     "no effect is left in what was fitted, and what was held out is off by {:.2g} times the noise: the hysteresis "
-    "there is not known from the rest, or something shows only there; to ask for it, diagnose all of it (--holdout 0)"
+    "there is not known from the rest, or something shows only there; to ask for it, diagnose with nothing held out"
 )
 
 
