@@ -1,7 +1,6 @@
 """The parts of a diagnosis, each against something plainer: dense least squares, known noise, planted faults."""
 
 from types import SimpleNamespace
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,16 +11,14 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 from fits import Record
-from fits.diagnosis import _effects
 from fits.diagnosis._discrepancy import learn_roughness, with_discrepancy
 from fits.diagnosis._effects import drop_programs
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Family, Probe, score
-from fits.stage._motion import program
+from fits.io._kept import kept
 from fits.stats._band import band_of
 from fits.stats._compare import surprise
 from fits.stats._noise import Noise, learn_noise
-from microid import AbstractPart, Scene, Signal
 from microid.effects import EFFECTS
 
 WHITE = np.zeros(0)
@@ -290,8 +287,7 @@ def test_evidence_beside_a_misfit_is_worth_less(rng):
         assert (found.robust_z > 0.6 * found.z) == trusted
 
 
-def test_programs_make_room_where_records_are_long(monkeypatch):
-    monkeypatch.setattr(_effects, "_MANY", 10**6)
+def test_programs_make_room_where_records_are_long():
     hosts = []
 
     @jax.jit
@@ -299,29 +295,22 @@ def test_programs_make_room_where_records_are_long(monkeypatch):
         hosts.append(1)
         return x + 1
 
-    class Part(AbstractPart):
-        takes: ClassVar[str] = "V"
-        gives: ClassVar[str] = "V"
-
-        def run(self, time_s, signal, scene=None):
-            traced.append(1)
-            return signal
+    @kept
+    def part(x):
+        traced.append(1)
+        return x
 
     traced: list[int] = []
-    signal = Signal(jnp.ones(7), jnp.ones(()), "first")
 
     def traces_after(n):
         drop_programs([Record(np.arange(float(n)), np.zeros(n), np.zeros(n), source="run")] * 2)
-        program()(Part(), jnp.ones(()), signal, Scene(signal, {}, None))
+        part(jnp.ones(7))
         host(jnp.ones(3))
         return len(traced), len(hosts)
 
     assert traces_after(1000) == (1, 1)
     assert traces_after(1000) == (1, 1)
     assert traces_after(10_000) == (2, 2)
-    # Where programs are many, those of the host stay.
-    monkeypatch.setattr(_effects, "_MANY", 0)
-    assert traces_after(1000) == (3, 2)
 
 
 def test_a_signal_without_columns_is_whitened(rng):

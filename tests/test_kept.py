@@ -3,6 +3,7 @@
 import os
 import shutil
 import time
+from collections import OrderedDict
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -98,6 +99,23 @@ def test_what_differs_is_another_program(folder, rng):
     for count, make in enumerate(made, 1):
         make()
         assert len(list(folder.iterdir())) == count
+
+
+def test_a_process_holds_those_that_it_used_last(monkeypatch):
+    monkeypatch.setattr(_kept, "_held", OrderedDict())
+    monkeypatch.setattr(_kept, "_MOST", 2)
+    traced = []
+
+    @kept
+    def double(x):
+        traced.append(x.shape)
+        return 2 * x
+
+    for n in (1, 2, 1, 3, 1, 2):
+        np.testing.assert_array_equal(double(jnp.ones(n)), np.full(n, 2.0))
+    # The second of two elements was forgotten when three came.
+    assert traced == [(1,), (2,), (3,), (2,)]
+    assert len(_kept._held) == 2
 
 
 def test_another_line_version_or_setting_is_another_program(monkeypatch, tmp_path):

@@ -5,21 +5,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.backend import get_backend
 from jaxtyping import Array, Float
 
 from fits.diagnosis._baseline import Baseline, with_effects
 from fits.diagnosis._records import LONG
+from fits.io._kept import forget_programs
 from fits.io._record import Record
-from fits.stage._motion import Prepared, at_samples, prepare, program, signals
+from fits.io._threads import map_in_threads
+from fits.stage._motion import Prepared, at_samples, prepare, signals
 from microid import Coordinates, Sensor
 from microid.effects import AbstractEffect
 
-# Number of programs, of some 5 MB each, from which on they make room for each other.
-_MANY = 200
 # Part of a period of the resonance between samples, beyond which a run does not resolve it.
 _PERIOD = 0.25
 # Periods of a line in a record, as its samples show it, below which it is a drift as well.
@@ -42,12 +40,12 @@ class Bench:
         few, many = (baseline.coarse_aside, baseline.finest_aside) if aside else (baseline.coarse, baseline.finest)
         self.resonance_Hz = baseline.resonance_Hz or 0.0
         self.prepared = [prepare(self.stage, run) for run in (many if finest else few)]
-        self.known = [signals(self.stage, one) for one in self.prepared]
+        self.known = map_in_threads(signals, [self.stage] * len(self.prepared), self.prepared)
         self.plain = [at_samples(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
 
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
-        return [self.respond_in(run, acting) for run, acting in enumerate(effects)]
+        return map_in_threads(self.respond_in, range(len(effects)), effects)
 
     def respond_in(self, run: int, effects: Sequence[AbstractEffect]) -> np.ndarray:
         """Simulate one run with effects; um, shape `(n,)`."""
@@ -65,20 +63,14 @@ class Bench:
 
     def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
         """What effects that all runs share change in them, in um."""
-        return [self.respond_in(run, effects) - plain for run, plain in enumerate(self.plain)]
+        moved = self.respond([effects] * len(self.plain))
+        return [one - plain for one, plain in zip(moved, self.plain, strict=True)]
 
 
 def drop_programs(records: Sequence[Record]) -> None:
-    """Free compiled programs, where records are long or programs are many.
-
-    Programs, and how JAX remembers them, take more memory than records of 30,000 samples do. Of long records all that
-    the process has compiled is freed; of short ones only what simulates parts, as the rest serves the next diagnosis.
-    """
-    long = sum(len(record) for record in records) >= LONG
-    if long or len(get_backend().live_executables()) > _MANY:
-        program.cache_clear()
-    if long:
-        jax.clear_caches()
+    """Free compiled programs where records are long: what JAX remembers of them takes memory, too."""
+    if sum(len(record) for record in records) >= LONG:
+        forget_programs()
 
 
 def without_drifts(effect: AbstractEffect, interval_s: float, duration_s: float) -> AbstractEffect:

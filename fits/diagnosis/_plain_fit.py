@@ -15,10 +15,12 @@ from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._score import Probe, applicable, law_of, probes_of, scales_of, score
 from fits.diagnosis._thresholds import Thresholds
+from fits.io._threads import map_in_threads
 from microid import Hold
-from microid.effects import EFFECTS, Scales
+from microid.effects import EFFECTS, AbstractEffect, Scales
 
 Holds = tuple[Hold, ...]
+_TOO_PLAIN = "the runs are too short or too plain to show it"
 IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
 # What is left exceeds noise by no more than this part of it.
@@ -225,16 +227,17 @@ def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLD
 
 def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
     """Simulate every probe of every effect that can be asked about, and say of the others why not."""
-    probes: list[Probe] = []
-    skipped = []
-    for form in EFFECTS:
+
+    def ask(form: type[AbstractEffect]) -> tuple[list[Probe], str | None]:
         reason = applicable(bench.baseline, form)
-        if reason is not None:
-            skipped.append((form.name, reason))
-            continue
-        found = list(probes_of(bench, form, scales, projector))
-        if not found:
-            why = "the runs are too short or too plain to show it"
-            skipped.append((form.name, "nothing of it was found, sample by sample" if form.statistic else why))
-        probes += found
-    return probes, skipped
+        found = [] if reason else list(probes_of(bench, form, scales, projector))
+        why = (
+            "nothing of it was found, sample by sample"
+            if form.statistic
+            else "the runs are too short or too plain to show it"
+        )
+        return found, reason or (None if found else why)
+
+    each = map_in_threads(ask, EFFECTS)
+    skipped = [(form.name, reason) for form, (_, reason) in zip(EFFECTS, each, strict=True) if reason is not None]
+    return [probe for found, _ in each for probe in found], skipped

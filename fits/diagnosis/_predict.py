@@ -10,6 +10,7 @@ from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression, beside, regress
 from fits.io._record import Record
+from fits.io._threads import map_in_threads
 from fits.loop._run import prepare_run
 from fits.stats._noise import Noise
 from microid.effects import AbstractEffect
@@ -197,12 +198,16 @@ def next_record(time_s: np.ndarray, voltage_V: np.ndarray, like: Record) -> Reco
 def _changes(bench: Bench, h: Hypothesis) -> tuple[list[np.ndarray], list[list[list[np.ndarray]]]]:
     """What a hypothesis changes in all runs, in um, and of each effect the derivatives along its coordinates."""
     at = bench.respond([h.effects(run) for run in range(len(bench.prepared))])
-    slopes: list[list[list[np.ndarray]]] = [[] for _ in h.laws]
+    slopes: list[list[list[np.ndarray]]] = []
+
+    def along(k: int, j: int) -> list[np.ndarray]:
+        law = h.laws[k]
+        moved = replace(h, x=(*h.x[:k], h.x[k] + _STEP * np.eye(law.size)[j], *h.x[k + 1 :]))
+        ahead = [bench.respond_in(i, moved.effects(i)) if j in law.places[i] else at[i] for i in range(len(at))]
+        return [(a - b) / _STEP for a, b in zip(ahead, at, strict=True)]
+
     for k, law in enumerate(h.laws):
-        for j, step in enumerate(_STEP * np.eye(law.size)):
-            moved = replace(h, x=(*h.x[:k], h.x[k] + step, *h.x[k + 1 :]))
-            ahead = [bench.respond_in(i, moved.effects(i)) if j in law.places[i] else at[i] for i in range(len(at))]
-            slopes[k].append([(a - b) / _STEP for a, b in zip(ahead, at, strict=True)])
+        slopes.append(map_in_threads(along, [k] * law.size, range(law.size)))
     return [a - b for a, b in zip(at, bench.plain, strict=True)], slopes
 
 

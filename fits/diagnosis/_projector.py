@@ -10,8 +10,8 @@ from scipy.linalg import cho_solve, solve_triangular
 from scipy.linalg.lapack import dpstrf
 
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._records import LONG
 from fits.diagnosis._regression import Regression, regress
+from fits.io._threads import map_in_threads
 from fits.loop._grid import non_negative
 from fits.loop._prior import Posterior, definite
 from fits.loop._result import FitError, FitStatus
@@ -74,7 +74,7 @@ class Projector:
         stops = np.cumsum([block[0].shape[1] for block in blocks])
         matrix = np.empty((len(nuisance), stops[-1] + nuisance.shape[1]))
         for block, stop in zip(blocks, stops, strict=True):
-            matrix[:, stop - block[0].shape[1] : stop] = self.join(block)
+            self.join(block, matrix[:, stop - block[0].shape[1] : stop])
         matrix[:, stops[-1] :] = nuisance
         row = self.count + len(regression.root)
         matrix[self.count : row, : len(regression.root)] = regression.root
@@ -100,10 +100,9 @@ class Projector:
         return self._kept
 
     def release(self) -> None:
-        """Free what takes the memory of long records, and is computed again where it is needed."""
-        if sum(map(len, self.masks)) >= LONG:
-            self.__dict__.pop("bare", None)
-            self._kept, self._regression = None, replace(self._regression, rows=())
+        """Free what takes the most memory, and is computed again where it is needed."""
+        self.__dict__.pop("bare", None)
+        self._kept, self._regression = None, replace(self._regression, rows=())
 
     def _factor(self) -> None:
         """Factorise the tangent of what is not held."""
@@ -183,13 +182,20 @@ class Projector:
             row, at = stop, at + o.shape[1]
         return out
 
-    def join(self, signals: Sequence[np.ndarray]) -> np.ndarray:
-        """Whiten signals of all runs, each of shape `(n, ...)`, and join them; shape `(count + priors, ...)`."""
-        out = np.zeros((self.count + self._priors, *signals[0].shape[1:]))
+    def join(self, signals: Sequence[np.ndarray], into: np.ndarray | None = None) -> np.ndarray:
+        """Whiten signals of all runs, each of shape `(n, ...)`, and join them; shape `(count + priors, ...)`.
+
+        Many at once are whitened some at a time: all of them would take the memory of several such results.
+        """
+        out = np.empty((self.count + self._priors, *signals[0].shape[1:])) if into is None else into
+        out[self.count :] = 0.0
         row = 0
         for signal, noise, mask in zip(signals, self.noise, self.masks, strict=True):
             stop = row + int(mask.sum())
-            out[row:stop] = noise.whiten(signal)[mask]
+            if out.ndim == 1:
+                out[row:stop] = noise.whiten(signal)[mask]
+            for at in range(0, out.shape[1] if out.ndim > 1 else 0, _AT_ONCE):
+                out[row:stop, at : at + _AT_ONCE] = noise.whiten(signal[:, at : at + _AT_ONCE])[mask]
             row = stop
         return out
 
@@ -199,8 +205,12 @@ class Projector:
 
     def take_off(self, joined: np.ndarray) -> None:
         """Project joined signals off the tangent in place and many at once: of long records they fill the memory."""
-        for at in range(0, joined.shape[1], _AT_ONCE):
+
+        def take(at: int) -> None:
             joined[:, at : at + _AT_ONCE] = self.off(joined[:, at : at + _AT_ONCE])
+
+        self._matrix  # noqa: B018  computed here and not in each thread
+        map_in_threads(take, range(0, joined.shape[1], _AT_ONCE))
 
     def split(self, joined: np.ndarray) -> list[np.ndarray]:
         """Cut a joined signal into those of the runs, whitened, at the samples that count."""
@@ -306,9 +316,12 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
 
 def take_off(joined: np.ndarray, basis: np.ndarray) -> None:
     """Project joined signals off orthonormal columns, in place and many at once: of long records they fill memory."""
-    for at in range(0, joined.shape[1], _AT_ONCE):
+
+    def take(at: int) -> None:
         columns = joined[:, at : at + _AT_ONCE]
         columns -= basis @ (basis.T @ columns)
+
+    map_in_threads(take, range(0, joined.shape[1], _AT_ONCE))
 
 
 def _inverse_root(gram: np.ndarray) -> np.ndarray:

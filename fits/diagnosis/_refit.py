@@ -10,6 +10,7 @@ import numpy as np
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
 from fits.diagnosis._projector import Projector, orthonormal
 from fits.diagnosis._score import Scored, law_of
+from fits.io._threads import map_in_threads
 from fits.io.columns import columns_beside
 from fits.io.columns.temperature import TEMPERATURE
 from fits.stats._score_test import BLOCK
@@ -301,18 +302,23 @@ def _fit(
         moved = aim - off(projector.join(change_um))
         return np.where(np.isfinite(moved), moved, 1e6)
 
+    def changes(flat: np.ndarray) -> list[np.ndarray]:
+        return map_in_threads(change_in, range(runs), [flat] * runs)
+
     def slope() -> np.ndarray:
         at, raw = projector.join(at_um), np.empty((len(target), len(flat)))
-        for k, step in enumerate(_STEP * np.eye(len(flat))):
-            moved = [change_in(run, flat + step) if counts[run][k] else um for run, um in enumerate(at_um)]
-            raw[:, k] = (projector.join(moved) - at) / _STEP
+        moves = [(run, k) for k in range(len(flat)) for run in range(runs) if counts[run][k]]
+        steps = flat + _STEP * np.eye(len(flat))
+        found = dict(zip(moves, map_in_threads(lambda move: change_in(move[0], steps[move[1]]), moves), strict=True))
+        for k in range(len(flat)):
+            raw[:, k] = (projector.join([found.get((run, k), um) for run, um in enumerate(at_um)]) - at) / _STEP
         raw = np.where(np.isfinite(raw), raw, 0.0)
         seen = -off(raw)
         return np.where(np.linalg.norm(seen, axis=0) > _ROUNDING_SHARE * np.linalg.norm(raw, axis=0), seen, 0.0)
 
     aim = target - basis @ (basis.T @ target)
     flat = np.concatenate(list(x[held:]))
-    at_um = [change_in(run, flat) for run in range(runs)]
+    at_um = changes(flat)
     residual = left(at_um)
     jacobian = slope() if rounds else np.zeros((len(residual), len(flat)))
     damping, farthest = 1e-3, _FARTHEST
@@ -327,7 +333,7 @@ def _fit(
             # No coordinate moves by more than a few e-folds at a time, or than less where that was too far, as near a
             # bound; one at its bound holds no other back. Cosine and sine of a line turn as its frequency moves.
             step = np.where(turning, step, np.clip(step, -farthest, farthest))
-            ahead_um = [change_in(run, flat + step) for run in range(runs)]
+            ahead_um = changes(flat + step)
             trial = left(ahead_um)
             if float(trial @ trial) < cost:
                 flat, at_um, residual, damping, moved = flat + step, ahead_um, trial, damping / 10, True

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from scipy.linalg import cholesky
 
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
+from fits.io._threads import map_in_threads
 from fits.loop._design import Grid
 from fits.loop._past import rough_past_columns
 from fits.loop._prior import interpolation
@@ -75,16 +76,16 @@ def regress(
     along columns through those that saturate.
     """
     chain, runs, z = baseline.chain, baseline.runs, jnp.asarray(baseline.z)
-    assert chain.grid is not None
+    grid = chain.grid
+    assert grid is not None
     effects = effects or ((),) * len(runs)
-    levelling = tuple(map(saturating, effects))
     roughness = _roughness(baseline) if finer is None else None
-    rows, nuisance, residuals = [], [], []
-    # By run, and then by kind.
-    structure: list[list[np.ndarray]] = []
     stage = baseline.stage
-    for run, many, few, there, own in zip(runs, baseline.fine, baseline.coarse, levelling, effects, strict=True):
-        here = with_effects_in(chain, baseline.z, there)
+
+    def each(
+        run: Run, many: Run, few: Run, own: Sequence[AbstractEffect]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
+        here = with_effects_in(chain, baseline.z, saturating(own))
         _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
@@ -95,22 +96,23 @@ def regress(
             both[first : first + len(columns), : chain.size] = columns[: n - first]
         around = both[:, : chain.size] @ baseline.columns_um
         both[:, : chain.size] = propagated(here.coordinates, here.place, z, run, around, both[:, : chain.size])
-        rows.append(both)
         plain = simulate(stage, many)
         speed = np.gradient(plain, run.record.time_s)
         late = [speed] if baseline.skewed else []
         # With an instant off by d, a reading is y + d y' + d^2 y'' / 2: the first is noise, the second is not.
         blur = [np.gradient(speed, run.record.time_s)] if baseline.blurred else []
-        nuisance.append(_without_decayed(np.column_stack([free[:n], *late, *blur]), run.fitted))
-        residuals.append(run.displacement_um - plain)
+        nuisance = _without_decayed(np.column_stack([free[:n], *late, *blur]), run.fitted)
+        structure = list[np.ndarray]()
         if roughness is not None:
-            fine = Chain(here.coordinates, here.place, Grid(chain.grid.lower_V, chain.grid.upper_V, _FINE))
+            fine = Chain(here.coordinates, here.place, Grid(grid.lower_V, grid.upper_V, _FINE))
             moved = np.concatenate([*combined(fine, z, run, roughness)])
-            structure.append(
-                np.split(propagated(fine.coordinates, fine.place, z, run, around, moved), [_FINE], axis=1)
-            )
+            structure = np.split(propagated(fine.coordinates, fine.place, z, run, around, moved), [_FINE], axis=1)
+        return both, nuisance, run.displacement_um - plain, structure
+
+    found = map_in_threads(each, runs, baseline.fine, baseline.coarse, effects)
+    rows, nuisance, residuals, structure = zip(*found, strict=True)
     kinds = (*zip(*structure, strict=True), _rough_pasts(baseline)) if finer is None else finer
-    data = tuple(rows), tuple(nuisance), kinds, tuple(residuals)
+    data = rows, nuisance, kinds, residuals
     return Regression(
         baseline, tuple(run.fitted for run in runs), *data, root_of(baseline.prior), tuple(map(tuple, effects))
     )
@@ -149,10 +151,9 @@ def _slope_of_change(baseline: Baseline, effects: Sequence[AbstractEffect], run:
     of exact derivatives would have to be compiled for every effect.
     """
     # Without driver and mechanics there are no coordinates.
-    out = np.zeros((len(run.record), len(baseline.z)))
     dependent = [one for one in effects if one.place not in ("environment", "noise")]
     if not dependent or len(baseline.z) == 0:
-        return out
+        return np.zeros((len(run.record), len(baseline.z)))
     here, prepared = baseline.stage.with_substeps(1), prepare(baseline.stage, run)
     known = signals(here, prepared)
 
@@ -162,9 +163,9 @@ def _slope_of_change(baseline: Baseline, effects: Sequence[AbstractEffect], run:
         extended = signals(with_effects(plain, dependent), prepared, plain, passed)
         return at_samples(extended[-1], prepared) - at_samples(passed[-1], prepared)
 
-    for k, step in enumerate(_STEP * np.eye(len(baseline.z))):
-        out[:, k] = (change(step) - change(-step)) / (2 * _STEP)
-    return out
+    steps = _STEP * np.eye(len(baseline.z))
+    ahead, behind = np.split(np.stack(map_in_threads(change, [*steps, *-steps])), 2)
+    return np.asarray((ahead - behind).T / (2 * _STEP))
 
 
 def _roughness(baseline: Baseline) -> np.ndarray:

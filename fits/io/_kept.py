@@ -7,8 +7,11 @@ import os
 import pickle
 import sys
 import tempfile
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
@@ -32,6 +35,10 @@ _KNOWN = {*_OTHERS, *_OWN, "builtins"}
 _UNUSED_s = 30 * 86400.0
 # Where programs are kept, since `keep_in`.
 _place: list[Path] = []
+# Programs that this process holds, the last used at the end, and how many at most: each takes some megabytes.
+_held: OrderedDict[Any, Future[Callable[..., Any]]] = OrderedDict()
+_MOST = 96
+_lock = threading.Lock()
 
 
 class _Unknown(Exception):
@@ -62,70 +69,111 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile a function as `equinox.filter_jit` does, and where programs are kept, trace it in the first call only.
 
     Programs are told apart by the name of the function, all that is no array, the shapes of arrays, versions,
-    settings, and every line of this package: of a function or class of another nothing is kept.
+    settings, and every line of this package: of a function or class of another nothing is kept. A process holds those
+    that it used last.
     """
     plain = eqx.filter_jit(function)
-    found: dict[Any, Callable[..., Any]] = {}
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         leaves, form = jax.tree.flatten((args, kwargs))
-        if not _place or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return plain(*args, **kwargs)
-        asked = _place[0], form, tuple(_kind(leaf) if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
-        if asked not in found:
-            found[asked] = _opened(_place[0], function, args, kwargs) or plain
-        return found[asked](*args, **kwargs)
+        kinds = tuple(_kind(leaf) if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
+        asked = function, *_place, form, kinds
+        with _lock:
+            is_new = asked not in _held
+            program = _held.setdefault(asked, Future())
+            _held.move_to_end(asked)
+            if len(_held) > _MOST:
+                _held.popitem(last=False)
+        if is_new:
+            try:
+                program.set_result(_compiled(function, args, kwargs))
+            except BaseException as error:
+                _held.pop(asked, None)
+                program.set_exception(error)
+        return program.result()(*args, **kwargs)
 
     return call
+
+
+def forget_programs() -> None:
+    """Free all that this process has compiled."""
+    _held.clear()
+    jax.clear_caches()
 
 
 def _kind(array: Any) -> tuple[Any, ...]:
     return array.shape, str(array.dtype), getattr(array, "weak_type", False)
 
 
-def _opened(
-    folder: Path, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> Callable[..., Any] | None:
-    """The program of a function for arguments like these, from the folder or new; None where it cannot be kept."""
+def _compiled(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[..., Any]:
+    """A function compiled for arguments like these: traced, or read from the folder where there is one.
+
+    What is compiled is held by nobody else, unlike what `jax.jit` compiles when it is called.
+    """
+    arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+    leaves = jax.tree.leaves(arrays)
+    exported = _exported(_place[0], function, arrays, static) if _place else None
+    if exported is None:
+        flat, given = _flat(function, arrays, static)
+        compiled = flat.lower(*leaves).compile()
+        places, rest = given
+    else:
+        stored, places, rest = exported
+
+        def program(*leaves: Any) -> Any:
+            return stored.call(*leaves)
+
+        program.__name__ = function.__name__
+        compiled = jax.jit(program).lower(*leaves).compile()
+    form = jax.tree.structure(places)
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        values = compiled(*jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array)))
+        if exported is not None:
+            # Their values alone: they come bound to a device, for which others would be compiled once more.
+            values = [jnp.asarray(np.asarray(value)) for value in values]
+        return eqx.combine(jax.tree.unflatten(form, values), rest)
+
+    return call
+
+
+def _exported(folder: Path, function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any, Any, Any] | None:
+    """A program from the folder, traced anew if it is not there; None where it cannot be kept.
+
+    With it come the places of the arrays that it gives, and what else it gives.
+    """
     if function.__module__.partition(".")[0] not in _OWN:
         return None
-    arrays, static = eqx.partition((args, kwargs), eqx.is_array)
     content = io.BytesIO()
     try:
         _Key(content).dump((function.__module__, function.__qualname__, jax.tree.map(_kind, arrays), static))
     except (_Unknown, pickle.PicklingError, AttributeError, TypeError, RecursionError):
         return None
-    name = hashlib.sha256(_circumstances() + content.getvalue()).hexdigest()
-    found = _read(folder / name)
+    file = folder / hashlib.sha256(_circumstances() + content.getvalue()).hexdigest()
+    found = _read(file)
     if found is None:
         try:
             found = _traced(function, arrays, static)
         except (ValueError, NotImplementedError):
             # What calls back into Python cannot be exported.
             return None
-        _write(folder / name, found)
-    exported, places, rest = found
-    form = jax.tree.structure(places)
-
-    def program(*leaves: Any) -> Any:
-        return exported.call(*leaves)
-
-    program.__name__ = function.__name__
-    compiled = jax.jit(program)
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        leaves = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
-        # Their values alone: they come bound to a device, for which others would be compiled once more.
-        values = [jnp.asarray(np.asarray(value)) for value in compiled(*leaves)]
-        return eqx.combine(jax.tree.unflatten(form, values), rest)
-
-    return call
+        _write(file, found)
+    return found
 
 
 def _traced(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any, Any, Any]:
-    """A program, the places of the arrays that it gives, and what else it gives."""
-    leaves, form = jax.tree.flatten(arrays)
+    flat, given = _flat(function, arrays, static)
+    exported = jax.export.export(flat)(*jax.tree.leaves(arrays))
+    # Nobody differentiates it, and the function that would cannot be written.
+    return replace(exported, _get_vjp=None), *given
+
+
+def _flat(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any, list[Any]]:
+    """A function of the arrays alone, and where tracing it puts their places in the result and what else it gives."""
+    form = jax.tree.structure(arrays)
     given: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
@@ -135,9 +183,8 @@ def _traced(function: Callable[..., Any], arrays: Any, static: Any) -> tuple[Any
         given[:] = jax.tree.unflatten(structure, range(len(values))), rest
         return values
 
-    exported = jax.export.export(jax.jit(flat))(*leaves)
-    # Nobody differentiates it, and the function that would cannot be written.
-    return replace(exported, _get_vjp=None), *given
+    flat.__name__ = function.__name__
+    return jax.jit(flat), given
 
 
 def _read(file: Path) -> tuple[Any, Any, Any] | None:

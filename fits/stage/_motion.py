@@ -1,9 +1,8 @@
 """What a command makes a stage do, between its samples as well: voltage at the piezo, displacement, derivatives."""
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import takewhile
 from typing import Any
 
@@ -33,14 +32,10 @@ def prepare(stage: Stage, run: Run) -> Prepared:
     return Prepared(run, Scene(command, samples.beside, samples.start.memory))
 
 
-@cache
-def program() -> Callable[[AbstractPart, Any, Signal, Scene], Signal]:
-    """Send a signal through one part: compiled for each kind of part and length of signal, until it is made anew."""
-
-    def through(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-        return part.run(time_s, signal, scene)
-
-    return kept(through)
+@kept
+def _through(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
+    """Send a signal through one part."""
+    return part.run(time_s, signal, scene)
 
 
 def signals(
@@ -54,7 +49,7 @@ def signals(
     same = sum(1 for _ in takewhile(lambda pair: _is_same(*pair), pairs))
     found = [*known[: same + 1]] or [prepared.scene.command]
     for part in stage.parts[same:]:
-        found.append(program()(part, prepared.run.samples.time_s, found[-1], prepared.scene))
+        found.append(_through(part, prepared.run.samples.time_s, found[-1], prepared.scene))
     return found
 
 

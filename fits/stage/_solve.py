@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from fits.io._threads import map_in_threads
 from fits.loop._design import Grid
 from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
@@ -264,7 +265,8 @@ def _gather(
         left = _residuals(chain, z, columns_um, runs)
         # Outliers count linearly (Huber).
         runs = [replace(run, weight=huber_weight(one, run.fitted)) for run, one in zip(runs, left, strict=True)]
-    sums = [run_sums(chain, jnp.asarray(z), jnp.asarray(columns_um), run, free) for run in runs]
+    place = chain, jnp.asarray(z), jnp.asarray(columns_um)
+    sums = map_in_threads(lambda run: run_sums(*place, run, free), runs)
     weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
     return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)
 
@@ -276,7 +278,7 @@ def _cost(runs: Sequence[Run], weighing: Weighing) -> float:
 
 def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequence[Run]) -> list[np.ndarray]:
     stage = chain.stage(jnp.asarray(z), jnp.asarray(columns_um))
-    return [residual_of(stage, run) for run in runs]
+    return map_in_threads(residual_of, [stage] * len(runs), runs)
 
 
 def _step(
