@@ -17,6 +17,8 @@ from microid.effects import Statistic
 
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
+# Part of a spike off what the stage would leave, if it moved, that is in what it leaves.
+_SEEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,11 @@ def find_faults(
         mask = run.fitted
         left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
         bad = spikes(run.record.voltage_V, left, 2 * quantum, thresholds.spike_z)
-        smooth = np.interp(np.arange(len(left)), np.flatnonzero(~bad), left[~bad]) if bad.any() else left
+        # A stage that would have to move far leaves spikes of its own, to first order, where the readings have none.
+        bad &= (residual - _between(residual, bad)) / np.where(bad, left - _between(left, bad), 1.0) > _SEEN
+        smooth = _between(left, bad)
         found.append(bad)
-        heights.append(np.where(bad, left - smooth, 0.0))
+        heights.append(left - smooth)
         fast.append(smooth)
         positions.append(run.displacement_um - left)
     fast = _without_cycles(fast, positions, [run.fitted for run in baseline.runs], thresholds)
@@ -121,6 +125,11 @@ def find_faults(
     size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
+
+
+def _between(values: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Values with those of bad samples on lines between their neighbours, shape `(n,)`."""
+    return np.interp(np.arange(len(values)), np.flatnonzero(~bad), values[~bad])
 
 
 def _without_cycles(
