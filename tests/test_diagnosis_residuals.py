@@ -242,6 +242,24 @@ def test_spikes_are_taken_out_and_the_noise_is_what_is_left(rng):
     assert not find_faults(whole, [heights]).repaired
 
 
+def test_spikes_of_a_stage_that_would_move_far_are_none_of_the_readings(rng):
+    n, where = 3000, 500 + 400 * np.arange(5)
+    reg = regression(rng, lengths=(n,), kinds=0)
+    time_s = np.arange(n) / 1000
+    left = 10 * np.sin(time_s) + 0.05 * rng.standard_normal(n)
+    # A column that follows what is left, but for a few samples where it makes spikes.
+    rows = np.zeros_like(reg.rows[0])
+    rows[:, 0] = np.sin(time_s)
+    rows[where, 0] += 0.5
+    run = run_of(np.sin(time_s), left)
+    reg.baseline.runs, reg.baseline.stroke_um, reg.baseline.dynamic = (run,), 20.0, False
+    reg.baseline.columns_um = np.zeros(12)
+    whole = Regression(reg.baseline, (run.fitted,), (rows,), reg.nuisance, (), (left,), 1e-6 * reg.root, ((),))
+    moved = left - rows[:, 0] * np.linalg.lstsq(rows[:, :1], left, rcond=None)[0]
+    assert np.abs(moved[where]).min() > 50 * 0.05
+    assert not find_faults(whole).repaired
+
+
 def test_a_prior_is_as_smooth_as_the_density(rng):
     baseline = baseline_of(rng)
     size, count = len(baseline.columns_um), 900

@@ -139,6 +139,14 @@ def test_of_a_run_that_goes_farther_at_its_end_less_is_held_out(rng):
     assert spread_of(estimated.held_out) < 0.25 * spread_of(stated.held_out)
 
 
+def test_what_a_run_reaches_first_at_its_end_is_followed_by_samples_that_are_fitted():
+    time_s = np.arange(600) * 0.01
+    voltage = np.where(np.arange(600) < 580, 0.4 + 0.3 * np.sin(time_s), 1.0)
+    run = prepare_run(Record(time_s, voltage, voltage), (0.0, 1.0), "unknown", 0.2, estimated=True)
+    # How far the step goes is told by what was before it and what comes after.
+    assert run.fitted[580:].sum() == run.held_out.sum() == 10
+
+
 def test_a_run_that_begins_near_its_highest_is_fitted_as_far_as_it_goes():
     time_s = np.arange(600) * 0.01
     # The way up is a hundredth of the range, and all that the past before the run reaches there.

@@ -164,7 +164,7 @@ def fit_baseline(
     stride = solved.runs[0].stride
 
     def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        held = _prepared(aside, range_V, initial, 0.0, many, False, held_holds)
+        held = _prepared(aside, range_V, initial, 0.0, many, past, held_holds)
         return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
     asked = _prepared(aside, range_V, initial, 0.0, _FINE, False)
@@ -263,7 +263,7 @@ def _static(
 ) -> Baseline:
     ready, held = (
         _prepared(records, range_V, initial, holdout, 1, past),
-        _prepared(aside, range_V, initial, 0.0, 1, False),
+        _prepared(aside, range_V, initial, 0.0, 1, past),
     )
     stroke, tried, _ = choose_grid(list(ready), None, progress, _FINEST)
     grid = tried.data.grid

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.optimize import least_squares
 
 from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.diagnosis._effects import Bench
@@ -16,14 +17,17 @@ from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
 from fits.diagnosis._thresholds import THRESHOLDS
+from fits.io._kept import kept
 from fits.loop._run import Run
 from fits.stage._motion import at_samples, signals
-from fits.stage._run import project_out
+from fits.stage._run import nuisance_columns, project_out
 from fits.stats._compare import is_worse, sd_of_difference
 from microid import Stage
 from microid.effects import AbstractEffect
 
 _ROUNDS = 6
+# Of the fit of what a run held out whole had gone through before, at most.
+_TRIED = 20
 
 
 @dataclass(frozen=True)
@@ -135,14 +139,41 @@ def _compare(
         )
     if ready.baseline.aside:
         behind = Bench(bench.baseline, aside=True, finest=finest)
-        for run, change_um in zip(ready.baseline.fine_aside, behind.change(effects), strict=True):
+        for k, run in enumerate(ready.baseline.fine_aside):
             plain = simulate(ready.baseline.stage, run)
-            better = simulate(bench.baseline.stage, run) + change_um
-            nuisance, using = np.ones((len(run.record), 1)), run.known
-            found.append(
-                Compared(run, left_of(run, nuisance, plain, using), left_of(run, nuisance, better, using), using)
-            )
+            nuisance, using = np.asarray(_nuisance(ready.baseline.stage, run.samples))[: len(run.record)], run.known
+            better_um = _with_past(behind, k, effects, run, simulate(bench.baseline.stage, run), nuisance)
+            found.append(Compared(run, left_of(run, nuisance, plain, using), better_um, using))
     return tuple(found)
+
+
+def _with_past(
+    behind: Bench,
+    k: int,
+    effects: Sequence[AbstractEffect],
+    run: Run,
+    plain_um: np.ndarray,
+    nuisance: np.ndarray,
+) -> np.ndarray:
+    """What the extended stage leaves of a run held out whole, shape `(n,)`, what effects remember fitted to it.
+
+    What a rig went through before a run is no more known of this than of those that were fitted.
+    """
+    own = [(at, name) for at, effect in enumerate(effects) for name in effect.history]
+
+    def left(past: np.ndarray) -> np.ndarray:
+        acting = list(effects)
+        for (at, name), value in zip(own, past, strict=True):
+            acting[at] = replace(acting[at], **{name: jnp.asarray(value)})
+        change_um = behind.respond_in(k, acting) - behind.plain[k]
+        return left_of(run, nuisance, plain_um + change_um, run.known)
+
+    nothing = np.zeros(len(own))
+    # As of the fitted runs, where the past is stated nothing of it is fitted.
+    if not own or not run.moving:
+        return left(nothing)
+    scale_um = float(np.std(run.displacement_um))
+    return left(least_squares(lambda past: left(past)[run.known] / scale_um, nothing, max_nfev=_TRIED).x)
 
 
 def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:
@@ -153,6 +184,7 @@ def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.n
 
 
 _without = eqx.filter_jit(project_out)
+_nuisance = kept(nuisance_columns)
 
 
 def predicts_worse(compared: Sequence[Compared], worse_z: float, most: float) -> bool:

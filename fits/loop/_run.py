@@ -202,7 +202,10 @@ def prepare_run(
     fitted = known.copy()
     if holdout > 0:
         first = n - round(holdout * n)
-        fitted[max(first, _as_far_as_it_goes(record.voltage_V)) if has_past else first :] = False
+        if has_past and (reached := _as_far_as_it_goes(record.voltage_V)) > first:
+            # What is left of its past is told by what comes after.
+            first = (reached + n) // 2
+        fitted[first:] = False
     if holdout < 1 and fitted.sum() < _FEWEST:
         raise DataError(
             f"{record.source}: only {fitted.sum()} samples are left to fit, {_FEWEST} are needed: the others come "
