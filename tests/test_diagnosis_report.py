@@ -1,22 +1,25 @@
 import html.parser
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import unescape
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from _diagnosis import KINDS, diagnosis, run_view
+from _diagnosis import KINDS, cause, diagnosis, run_view
 
 from fits import ParameterEstimate
-from fits.diagnosis._result import Gain, RunView
+from fits.diagnosis._findings import _given
+from fits.diagnosis._result import Gain, RunView, law_in_words
 from fits.plots._diagnosis import residual_figure
 from fits.plots._residual_views import VIEWS
 from fits.plots._style import thinned
 from fits.report._diagnosis import report_html
 from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
 from fits.report._words import chance, estimate, heading, number, parameter_name, percent, plain, shown_unit, sigmas
-from microid.effects import card_of
+from microid import Mechanics
+from microid.effects import EFFECTS, card_of
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 
@@ -82,8 +85,8 @@ def test_the_summary_tells_parameters_with_units_and_is_what_a_notebook_shows(rn
     found = diagnosis(rng, kind)
     text = found.summary()
     assert text.splitlines()[0].startswith(("no effect found", "effect found", "unexplained error"))
-    for cause in found.causes:
-        assert re.search(rf"{cause.name}.*: 24.3 standard deviations, by chance below 1e-09$", text, re.MULTILINE)
+    for one in found.causes:
+        assert re.search(rf"{one.name}.*: 24.3 standard deviations, by chance below 1e-09$", text, re.MULTILINE)
         assert re.search(r"gain_per_decade +0\.01542 \+- 0\.00031$", text, re.MULTILINE)
         assert re.search(r"onset_s +0\.1 \(95 %: nan to inf\) s$", text, re.MULTILINE)
     assert repr(found) == text
@@ -284,6 +287,26 @@ def test_a_hum_is_told_by_the_amplitudes_of_its_lines(rng, form, mains_Hz):
     for one, spread_um, size_um in zip(hum.shown, drawn.std(0).ravel(), drawn.mean(0).ravel(), strict=False):
         assert one.sd == pytest.approx(spread_um, rel=0.1) or size_um < 5 * spread_um
     for text in (found.summary(), report_html(found)):
-        assert "cosine" not in text
+        # But in the law, which is there to be unfolded.
+        assert "cosine" not in re.sub(r'<pre class="law">.*?</pre>', "", text, flags=re.DOTALL)
         assert f"amplitude at {mains_Hz}" in text.replace("\N{NO-BREAK SPACE}", " ")
     assert "cosine_um[0] in run 1" in diagnosis_json(found)["causes"][0]["parameters"]
+
+
+@pytest.mark.parametrize("form", [form for form in EFFECTS if not form.statistic], ids=lambda form: form.__name__)
+def test_the_law_of_an_effect_says_what_each_parameter_is(form):
+    law = law_in_words(form)
+    for one in fields(form):
+        if one.name != "inner":
+            assert re.search(rf"\b{one.name}\b", law), one.name
+    assert "inner" not in law.split()
+    assert not {"`", "math::", "----"} & set(re.findall(r"`|math::|----", law))
+
+
+def test_constants_that_are_not_fitted_are_shown_with_the_parameters(rng, tmp_path):
+    known = replace(cause("creep"), given={"half_stroke_um": 17.25})
+    found = replace(diagnosis(rng), causes=(known,))
+    assert re.search(r"half_stroke_um +17\.25, given", found.summary())
+    hardening = next(form for form in EFFECTS if form.name == "stiffness_hardening")
+    effect = hardening(Mechanics(100.0, 0.1, 1.0), *map(jnp.asarray, (0.01, 3.0, 17.25)))
+    assert _given(effect) == {"half_stroke_um": 17.25}

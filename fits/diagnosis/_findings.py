@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ from fits.diagnosis._refit import Refit, refit, refit_around
 from fits.diagnosis._result import Bound, FoundCause
 from fits.diagnosis._score import Scored, best_of
 from fits.loop._result import ParameterEstimate
+from fits.stage._encode import spec_of
 from fits.stats._held import Held
 from fits.stats._metrics import TWO_SIDED_95
 from microid import Coordinates
@@ -79,7 +80,8 @@ def causes_of(
             continue
         # What is named beside it is no alternative to it.
         rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS] if rival.name not in beside_it)
-        found[cause.name] = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
+        named = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
+        found[cause.name] = replace(named, given=_given(law.effect(x, 0)))
     forms: dict[Statistic, type[AbstractEffect]] = {form.statistic: form for form in EFFECTS if form.statistic}
     total = float(np.mean([n.total_um**2 for n in noise.noise]))
     for fault in faults:
@@ -119,6 +121,12 @@ def described(
     """A cause with what its effect's card says of it."""
     card = form.fingerprint, form.experiment, form.source
     return FoundCause(form.name, form.form, rivals, float(z), p, parameters, float(min(1.0, share)), rms_um, *card)
+
+
+def _given(effect: AbstractEffect) -> dict[str, float]:
+    """Constants of an effect's law that are not fitted."""
+    values = {one.name: getattr(effect, one.name) for one in fields(effect) if spec_of(one) is None}
+    return {name: float(value) for name, value in values.items() if eqx.is_array(value) and value.ndim == 0}
 
 
 def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:

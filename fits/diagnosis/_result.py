@@ -1,6 +1,7 @@
 """What a diagnosis gives back."""
 
 import enum
+import inspect
 import math
 import re
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ from fits.loop._result import ParameterEstimate
 from fits.stage._uncertainty import StageUncertainty
 from fits.stats._metrics import TWO_SIDED_95
 from microid import Stage
-from microid.effects import EFFECTS, card_of
+from microid.effects import EFFECTS, AbstractEffect, card_of
 
 Verdict = Literal["no_effect", "effect_found", "unexplained"]
 SCHEMA = "microid.diagnosis/1"
@@ -48,7 +49,8 @@ class FoundCause:
     it. `z` is the evidence in standard deviations, and `p_family` the probability that chance gives any effect as
     much where there is none. `share_of_misfit` is the part that it explains of the reproducible variance that the
     plain stage leaves, and `rms_um` the size of what it changes after the plain stage followed as far as it can.
-    `fingerprint`, `experiment` and `source` are sentences about the effect.
+    `fingerprint`, `experiment` and `source` are sentences about the effect; `given` are constants of its law that
+    were not fitted, by their names, which carry the unit.
     """
 
     name: str
@@ -62,11 +64,21 @@ class FoundCause:
     fingerprint: str
     experiment: str
     source: str
+    given: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def law(self) -> str:
+        """The equation of its model and what each parameter is, in the notation of LaTeX."""
+        return law_in_words(self._form)
+
+    @property
+    def _form(self) -> type[AbstractEffect]:
+        return next((one for one in EFFECTS if (one.name, one.form) == (self.name, self.form)), card_of(self.name))
 
     @property
     def shown(self) -> tuple[ParameterEstimate, ...]:
         """The parameters as people read them: of lines the amplitudes, for their cosines and sines."""
-        card = next((one for one in EFFECTS if (one.name, one.form) == (self.name, self.form)), card_of(self.name))
+        card = self._form
         if not card.phases:
             return self.parameters
         cosine, sine = card.phases
@@ -79,6 +91,13 @@ class FoundCause:
             elif field != sine:
                 out.append(one)
         return tuple(out)
+
+
+def law_in_words(form: type[AbstractEffect]) -> str:
+    """What the docstring of an effect says of its model, but for its first line and the part that it is around."""
+    _, _, law = (inspect.getdoc(form) or "").partition("\n\n")
+    words = law.replace("Attributes\n----------\n", "").replace(".. math:: ", "").replace(".. math::\n", "")
+    return re.sub(r"^inner\n(?: .*\n)+", "", words.replace("`", ""), flags=re.MULTILINE).strip()
 
 
 # A field, the place of an entry in it, and of which run it is.
@@ -248,6 +267,7 @@ class Diagnosis(AbstractSummary):
                 if not min(below, above) > 0.8 * max(below, above):
                     spread = f"(95 %: {each.lower:.3g} to {each.upper:.3g}){unit}"
                 lines.append(f"    {each.name:24} {each.value:.4g} {spread}")
+            lines += [f"    {name:24} {value:.4g}, given" for name, value in cause.given.items()]
         if self.unexplained_rms_um > 0:
             lines.append(f"  unexplained: {length(self.unexplained_rms_um)} beyond the noise")
         gain = self.gain

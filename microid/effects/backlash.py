@@ -62,9 +62,16 @@ class Backlash(_AbstractBacklash):
 
 @register
 class OutputBacklash(_AbstractBacklash):
-    r"""Clearance behind the mechanics, as of a guide, which the mass drags along; the fields are those of `Backlash`.
+    r"""Clearance behind the mechanics, as of a guide, which the mass drags along.
 
     .. math:: y_k = \min(\max(y_{k-1}, x_k - b), x_k + b)
+
+    Attributes
+    ----------
+    half_gap_um
+        `b`.
+    start
+        Where in its clearance it stands before the first sample, from -1 to 1, as of `Backlash`.
     """
 
     form: ClassVar[str] = "output"
