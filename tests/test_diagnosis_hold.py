@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fits.diagnosis import _plain_fit
 from fits.diagnosis._plain_fit import PlainFit
 from fits.diagnosis._prepare import _hold_of_plateaus
 from fits.diagnosis._thresholds import THRESHOLDS
@@ -79,3 +80,15 @@ def test_runs_of_one_rig_go_apart_only_where_that_is_more_than_a_small_part_of_t
         largest_z=lambda at=left: (0.75 * excess - 40_000 * (at is apart)) ** 0.5 if at is not bad else 0.0,
     )
     assert (PlainFit.better_holds(fit, THRESHOLDS) == ("zero", "first")) == mixed
+
+
+@pytest.mark.parametrize(("curves", "kept"), [(22.31, True), (22.6, True), (10.0, False)])
+def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(monkeypatch, curves, kept):
+    # In noise variances; as much as 22.5 is left beside lines.
+    lines, there = np.full(10_000, 22.5**0.5), np.full(10_000, curves**0.5)
+    projector = SimpleNamespace(off=lambda joined: joined, residual=there)
+    monkeypatch.setattr(_plain_fit, "Projector", lambda *_: SimpleNamespace(bounded=lambda: projector))
+    nothing = {"left_beside_lag": lambda: np.inf, "left_beside_delay": lambda: np.inf}
+    fit = SimpleNamespace(left=lines, faults=SimpleNamespace(noise=None), **nothing)
+    other = SimpleNamespace(regression=None, holds=("smooth",), largest_z=lambda: 30.0)
+    assert PlainFit.outdoes(fit, other) == kept

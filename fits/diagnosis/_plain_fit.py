@@ -21,6 +21,7 @@ from microid.effects import EFFECTS, AbstractEffect, Scales
 
 Holds = tuple[Hold, ...]
 _TOO_PLAIN = "the runs are too short or too plain to show it"
+IN_LINES: Holds = ("first",)
 IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
 # What is left exceeds noise by no more than this part of it.
@@ -211,6 +212,10 @@ class PlainFit:
             return False
         if "zero" in other.holds:
             return self.left_beside_lag() < rest
+        # Of what is more than noise either way, a small part decides nothing.
+        here = float(self.left @ self.left)
+        if here - whole < _NOISE * (here - len(left)):
+            return True
         beside = min(self.left_beside_lag(), self.left_beside_delay())
         return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)
 

@@ -9,7 +9,7 @@ from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._noise import Faults, find_faults
-from fits.diagnosis._plain_fit import IN_STEPS, Holds, PlainFit
+from fits.diagnosis._plain_fit import IN_LINES, IN_STEPS, Holds, PlainFit
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Step
@@ -130,6 +130,11 @@ def prepare_diagnosis(
                 here = other if other.leaves_less(here) else here
             else:
                 other = fitted(holds, here.regression.baseline.problem)
+                lines = IN_LINES * len(records)
+                if "smooth" in holds and lines not in (here.holds, holds) and has_time():
+                    # Levels looked like steps, which are as far from lines as from curves.
+                    plain = fitted(lines, other.regression.baseline.problem)
+                    other = plain if plain.outdoes(other) else other
                 # What comes late at a sensor looks like a command that does so between samples.
                 here = here if here.outdoes(other) else other
             drop_programs(records)
