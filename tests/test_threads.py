@@ -1,13 +1,31 @@
-"""What is computed in threads is what one thread computes."""
+"""What is computed in threads is what one thread computes; and those of linear algebra, as the libraries say."""
 
 import os
 import threading
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from fits.io import _threads
-from fits.io._threads import map_in_threads
+from fits.io._threads import map_in_threads, one_thread
+
+
+def threads():
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.mark.parametrize("stated", [None, "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"])
+def test_linear_algebra_has_one_thread_unless_the_environment_says_otherwise(monkeypatch, stated):
+    for name in _threads._STATED:
+        monkeypatch.delenv(name, raising=False)
+    if stated:
+        monkeypatch.setenv(stated, "2")
+    with threadpool_limits(2, "blas"):
+        before = threads()
+        within = one_thread(threads)()
+        assert within == ({1} if stated is None else before)
+        assert threads() == before
 
 
 @pytest.fixture
@@ -32,7 +50,7 @@ def test_two_compute_at_once(pool):
 
 def test_inside_another_call_one_thread_is_used(pool):
     def inner(_):
-        return {threading.current_thread().name for _ in range(1)}.pop()
+        return threading.current_thread().name
 
     def outer(_):
         return threading.current_thread().name, set(map_in_threads(inner, range(8)))
