@@ -340,6 +340,7 @@ def test_the_class_of_a_cause_lists_none_that_is_named_beside_it(monkeypatch):
     projector = SimpleNamespace(join=np.concatenate, off=lambda x: x, masks=[np.ones(3, bool)], count=3)
     monkeypatch.setattr(_findings, "profile_likelihood", lambda *_: [])
     monkeypatch.setattr(_findings, "_parameters", lambda *_: ())
+    monkeypatch.setattr(_findings, "_given", lambda _: {})
     beside = SimpleNamespace(bench=bench, projector=projector)
     found = _findings.causes_of(
         causes, model, beside, (1.0, 1.0), (), SimpleNamespace(noise=[SimpleNamespace(total_um=1.0)])

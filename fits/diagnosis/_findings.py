@@ -81,7 +81,7 @@ def causes_of(
         # What is named beside it is no alternative to it.
         rivals = tuple(rival.name for rival in cause.rivals[:MOST_RIVALS] if rival.name not in beside_it)
         named = described(law.form, rivals, cause.z, cause.p_family, parameters, share, rms_um)
-        found[cause.name] = replace(named, given=_given(law.effect(x, 0)))
+        found[cause.name] = replace(named, given=_given(law.effects(x)[0]))
     forms: dict[Statistic, type[AbstractEffect]] = {form.statistic: form for form in EFFECTS if form.statistic}
     total = float(np.mean([n.total_um**2 for n in noise.noise]))
     for fault in faults:
