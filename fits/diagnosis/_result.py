@@ -94,10 +94,9 @@ class FoundCause:
 
 
 def law_in_words(form: type[AbstractEffect]) -> str:
-    """What the docstring of an effect says of its model, but for its first line and the part that it is around."""
-    _, _, law = (inspect.getdoc(form) or "").partition("\n\n")
-    words = law.replace("Attributes\n----------\n", "").replace(".. math:: ", "").replace(".. math::\n", "")
-    return re.sub(r"^inner\n(?: .*\n)+", "", words.replace("`", ""), flags=re.MULTILINE).strip()
+    """What the docstring of an effect says of its model, but for the part that it is around."""
+    words = re.sub(r"Attributes\n-+\n|\.\. math::[ \n]|`", "", inspect.getdoc(form) or "")
+    return re.sub(r"^inner\n(?: .*\n)+", "", words, flags=re.MULTILINE).strip()
 
 
 # A field, the place of an entry in it, and of which run it is.
