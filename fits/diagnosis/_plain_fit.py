@@ -20,7 +20,8 @@ from microid import Hold
 from microid.effects import EFFECTS, AbstractEffect, Scales
 
 Holds = tuple[Hold, ...]
-_TOO_PLAIN = "the runs are too short or too plain to show it"
+# Why an effect was not asked about.
+_NO_SAMPLES, _TOO_PLAIN = "nothing of it was found, sample by sample", "the runs are too short or too plain to show it"
 IN_LINES: Holds = ("first",)
 IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
@@ -236,12 +237,8 @@ def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Pr
     def ask(form: type[AbstractEffect]) -> tuple[list[Probe], str | None]:
         reason = applicable(bench.baseline, form)
         found = [] if reason else list(probes_of(bench, form, scales, projector))
-        why = (
-            "nothing of it was found, sample by sample"
-            if form.statistic
-            else "the runs are too short or too plain to show it"
-        )
-        return found, reason or (None if found else why)
+        unseen = _NO_SAMPLES if form.statistic else _TOO_PLAIN
+        return found, reason or (None if found else unseen)
 
     each = map_in_threads(ask, EFFECTS)
     skipped = [(form.name, reason) for form, (_, reason) in zip(EFFECTS, each, strict=True) if reason is not None]
