@@ -21,7 +21,8 @@ from microid.effects import EFFECTS, AbstractEffect, Scales
 
 Holds = tuple[Hold, ...]
 # Why an effect was not asked about.
-_NO_SAMPLES, _TOO_PLAIN = "nothing of it was found, sample by sample", "the runs are too short or too plain to show it"
+_NO_SAMPLES = "nothing of it was found, sample by sample"
+_TOO_PLAIN = "the runs are too short or too plain to show it"
 IN_LINES: Holds = ("first",)
 IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
