@@ -17,7 +17,6 @@ from fits.diagnosis._safe import guard_of
 from fits.diagnosis._score import best_of, law_of
 from fits.io._limits import MARGIN, RangeMap
 from fits.io._record import Record
-from fits.io._threads import map_in_threads
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Progress
 from microid.effects import card_of
@@ -80,22 +79,18 @@ def suggest(
     programs = guard.menu(limits, _MOST_SAMPLES)
     if not programs:
         return None
-
-    first = programs[0]
-
-    def predicted(program: Program) -> float:
-        in_time = program is first or request.has_time()
-        return predictor.predicted_z(*program.samples(program.start)) if in_time else float("nan")
-
-    each = zip(programs, map_in_threads(predicted, programs), strict=True)
-    known = [(program, z) for program, z in each if not np.isnan(z)]
-    programs, scores = tuple(program for program, _ in known), [z for _, z in known]
+    scores = []
+    for program in programs:
+        scores.append(predictor.predicted_z(*program.samples(program.start)))
+        if not request.has_time():
+            break
+    programs = programs[: len(scores)]
     column = further_column(names, records)
     asked = predictor
     if column and max(scores) < 1.0:
         # Only the column tells: what shows the first of them best is played with it.
         asked = Predictor(found.bench, found.projector, (hypotheses[0], hypotheses[0].without(names[0])), ((0, 1),))
-        scores = map_in_threads(lambda one: asked.predicted_z(*one.samples(one.start)), programs)
+        scores = [asked.predicted_z(*program.samples(program.start)) for program in programs]
     near = [(one, z) for one, z in zip(programs, scores, strict=True) if z >= _NEARLY_BEST * max(scores)]
     program, z = min(near, key=lambda one: (one[0].limits.duration_s, -one[1]))
     progress(f"refining {program.words}")
@@ -187,7 +182,7 @@ def refine(program: Program, gain: Callable[[np.ndarray], float], first: float) 
         if size == 0:
             break
         tried = [np.clip(best + length * span * slope / size, program.lower, program.upper) for length in _LENGTHS]
-        gains = map_in_threads(gain, tried)
+        gains = [gain(p) for p in tried]
         if np.isnan(gains).all():
             break
         highest = int(np.nanargmax(gains))
