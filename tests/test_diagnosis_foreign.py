@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.signal import fftconvolve, lsim
+from scipy.signal import fftconvolve, lfilter, lsim
 
 from fits import Record, diagnose
 from fits.diagnosis._regression import _without_decayed
@@ -69,6 +69,25 @@ def test_a_smooth_command_is_no_effect(rng):
     assert any("along curves" in words for words in found.remarks)
     assert found.noise_um == pytest.approx(0.01, rel=0.1)
     assert found.gain.heldout_rms_before_um < 1.3 * 0.01
+
+
+@pytest.mark.study
+def test_coloured_noise_is_no_misfit(rng):
+    """Noise of first order that no idle stretch shows: as if it were white, half of it would be left over."""
+
+    def lines(t):
+        return np.interp(t, times_s, levels_V)
+
+    levels_V = np.r_[0, 100, rng.uniform(0, 100, 123), 0]
+    times_s = 0.02 * np.arange(len(levels_V))
+    records = [Record(np.arange(2500) / 100, SLOW_V, plays(SLOW_V), source="a"), rig(rng, lines, 2.5, 0.0)]
+    noise = [lfilter([1.0], [1.0, -0.6], rng.standard_normal(len(r) + 99))[99:] * 0.025 * 0.8 for r in records]
+    found = diagnose(
+        [replace(r, displacement_um=np.asarray(r.displacement_um) + n) for r, n in zip(records, noise, strict=True)]
+    )
+    assert found.verdict == "no_effect"
+    assert "neighbours are correlated" in found.noise_source
+    assert found.noise_um == pytest.approx(0.025, rel=0.4)
 
 
 @pytest.mark.study

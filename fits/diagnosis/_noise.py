@@ -121,7 +121,11 @@ def find_faults(
     if all(floor.idle for floor in floors):
         source = "idle stretches of the runs"
     elif not any(floor.idle for floor in floors):
-        source = "the fastest changes of the residual, as if it were white"
+        source = "the fastest changes of the residual"
+    if any(len(floor.noise.past) for floor in floors if not floor.idle):
+        source += ", of which neighbours are correlated"
+    elif not all(floor.idle for floor in floors):
+        source += ", as if it were white"
     size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)

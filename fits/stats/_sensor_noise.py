@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from fits.stats._colour import Spectrum, coloured
 from fits.stats._noise import Noise, idle_stretches, learn_noise, rough_noise_um, stretches
 from fits.stats._noise_spectrum import DRIFT, MAINS_Hz
 
@@ -28,10 +29,14 @@ _ROUNDING = 10.0
 
 @dataclass(frozen=True)
 class Floor:
-    """What a run's noise is, whatever a model leaves, and how many `idle` samples it was read off; 0 for none."""
+    """What a run's noise is, whatever a model leaves, and how many `idle` samples it was read off; 0 for none.
+
+    Of none it is white, and `fast` is the spectrum of the fastest changes, which shows whether it is.
+    """
 
     noise: Noise
     idle: int
+    fast: Spectrum | None = None
 
 
 def floor_of(
@@ -67,7 +72,8 @@ def floor_of(
         if level > 0:
             correlated = abs(correlation) * len(joined) ** 0.5 > same_z
             return Floor(learn_noise(joined, freedom) if correlated else white_noise(level), len(joined))
-    return Floor(white_noise(max(rough_noise_um(residual_um[used]), least_um)), 0)
+    left_um = residual_um[used]
+    return Floor(white_noise(max(rough_noise_um(left_um), least_um)), 0, Spectrum.of(left_um))
 
 
 def white_noise(level_um: float) -> Noise:
@@ -76,15 +82,20 @@ def white_noise(level_um: float) -> Noise:
 
 
 def pooled(floors: Sequence[Floor], same_z: float) -> list[Floor]:
-    """Floors of one sensor: white noise that was read off idle stretches, and is the same in all runs by chance."""
+    """Floors of one sensor: what they agree on, within so many standard deviations, is the same in all runs.
+
+    That is the level of white noise that was read off idle stretches, and the colour of noise that was not.
+    """
+    colours = coloured([floor.fast for floor in floors], same_z)
+    floors = [one if c is None else replace(one, noise=c) for one, c in zip(floors, colours, strict=True)]
     white = [floor.idle > 0 and len(floor.noise.past) == 0 for floor in floors]
     if sum(white) < 2:
-        return list(floors)
+        return floors
     counts = np.array([floor.idle for floor in floors])[white]
     levels = np.array([floor.noise.innovation_um for floor in floors])[white]
     level = float(np.sqrt(np.average(levels**2, weights=counts)))
     if np.any(np.abs(levels / level - 1) > same_z / np.sqrt(2 * counts)):
-        return list(floors)
+        return floors
     return [replace(one, noise=white_noise(level)) if own else one for one, own in zip(floors, white, strict=True)]
 
 
