@@ -3,12 +3,16 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _models import random_model
 from scipy.interpolate import BSpline
+from scipy.signal import lsim
 
+import microid as m
 from fits import Record
 from fits.diagnosis._baseline import has_known_loop
 from fits.loop._past import past_columns, rough_past_columns
 from fits.loop._run import prepare_run
+from fits.stage._run import nuisance_columns
 
 LEVELS = 120
 
@@ -93,6 +97,34 @@ def test_the_past_of_few_plays_has_kinks_that_no_spline_follows(rng, way):
     assert np.std(difference) > 0.01
     assert less < 0.5 * left
     assert less < 0.02 * np.std(difference)
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_what_a_past_adds_rings_as_the_mechanics_does(rng, stride):
+    """A jump to where the run has not been, of plays in random states between two lags, by SciPy."""
+    rate_Hz, natural = 4000.0, 2 * np.pi * rng.uniform(150, 400)
+    lag_s = rng.uniform(2e-4, 2e-3)
+    parts = {"hysteresis": random_model(rng), "mechanics": m.Mechanics(natural / (2 * np.pi), 0.03)}
+    stage = m.Stage.of(driver=m.Driver(lag_s), **parts)
+    time_s = np.arange(2000) / rate_Hz
+    volts = np.interp(time_s, [0, 0.1, 0.2, 0.25, 0.2501, 0.4, 0.5], np.array([0.3, 0.5, 0.2, 0.4, 0.9, 0.1, 0.3]))
+    fine_s = np.arange(1999 * 8 + 1) / rate_Hz / 8
+    command_V = np.interp(fine_s, time_s, volts)
+    driven_V = volts[0] + lsim(([1.0], [lag_s, 1.0]), command_V - volts[0], fine_s)[1]
+    difference = np.zeros(len(fine_s))
+    for radius in np.linspace(0.02, 0.4, 60):
+        before = driven_V[0] + radius * rng.uniform(-1, 1)
+        difference += np.exp(-radius / 0.2) * (
+            play(driven_V, radius, before) - play(driven_V, radius, driven_V[0] - radius)
+        )
+    moved = lsim(([natural**2], [1.0, 0.06 * natural, natural**2]), difference - difference[0], fine_s)[1][::8]
+    run = prepare_run(Record(time_s, volts, volts), (0.1, 0.9), "unknown", 0.0, stride, estimated=True)
+    basis = np.asarray(nuisance_columns(stage, run.samples))[: len(moved)]
+    still = np.concatenate([past_columns(jnp.asarray(driven_V[::8])), np.ones((len(moved), 1))], axis=1)
+    left, less = (np.std(moved - one @ np.linalg.lstsq(one, moved, rcond=None)[0]) for one in (still, basis))
+    assert np.std(moved) > 0.01
+    assert less < 0.1 * left
+    assert less < 0.02 * np.std(moved)
 
 
 def test_columns_are_the_b_splines_of_scipy(rng):

@@ -20,7 +20,7 @@ from fits.stage._chain import Chain
 from fits.stage._columns import combined, pieces, propagated
 from fits.stage._moments import linearise
 from fits.stage._motion import at_samples, prepare, signals
-from fits.stage._run import ahead, place_of_hysteresis
+from fits.stage._run import ahead, answered, place_of_hysteresis
 from microid import Coordinates, Stage
 from microid.effects import PLACES, AbstractEffect
 
@@ -194,8 +194,9 @@ def _rough_pasts(baseline: Baseline) -> tuple[np.ndarray, ...]:
     assert place is not None
     levels_V, own = np.linspace(float(grid.lower_V), float(grid.upper_V), _PAST), []
     for run in baseline.runs:
-        seen_V = np.asarray(ahead(stage, place, run.samples))[:: run.samples.stride][: len(run.record)]
+        seen_V = np.asarray(ahead(stage, place, run.samples))
         columns = rough_past_columns(seen_V, levels_V) * baseline.stroke_um / np.ptp(levels_V)
+        columns = np.asarray(answered(stage, place, run.samples, jnp.asarray(columns)))[: len(run.record)]
         own.append(columns if run.has_past else columns[:, :0])
     stops = np.cumsum([columns.shape[1] for columns in own])
     return tuple(

@@ -41,8 +41,8 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
     if samples.has_past and place is not None:
-        past = past_columns(ahead(stage, place, samples)[:: samples.stride])
-        offset = jnp.concatenate([offset, past], axis=1)
+        past = past_columns(ahead(stage, place, samples))
+        offset = jnp.concatenate([offset, answered(stage, place, samples, past)], axis=1)
     behind = stage.parts[0 if place is None else place + 1 :]
     if samples.moving:
         time = samples.time_s - samples.time_s.ravel()[0]
@@ -61,6 +61,15 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
         return alone.respond(samples.time_s, nothing, jnp.ones(()))[:: samples.stride]
 
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
+
+
+def answered(stage: m.Stage, place: int, samples: Samples, columns: Float[Array, "m k"]) -> Float[Array, "n k"]:
+    """What a linear chain behind a part makes of signals at the refined times, but for factors, at the samples."""
+    system = joined(stage.parts[place + 1 :])
+    if system is not None and system.order:
+        system = replace(system, offset=jnp.zeros(()))
+        columns = jax.vmap(lambda one: system.respond(samples.time_s, one, one[0]), 1, 1)(columns)
+    return columns[:: samples.stride]
 
 
 @kept
