@@ -10,7 +10,7 @@ from _sweeps import parsed
 
 import fits
 from fits.control._gains import GAINS
-from fits.control._make import strongest_Hz
+from fits.control._period import strongest_Hz
 from fits.io._record import Reference
 from fits.sweeps._spec import chunk_count, compute_chunk
 from fits.sweeps._stages import memory_before, nominal_stage, varied
@@ -187,6 +187,16 @@ def test_a_single_move_has_no_period(middle, rng):
     assert strongest_Hz(np.zeros(500), 1e-2) is None
     periods = rng.uniform(3, 50)
     assert strongest_Hz(move / 50 + np.sin(2 * np.pi * periods * x), 1e-2) == pytest.approx(periods / 5, rel=0.02)
+
+
+@pytest.mark.parametrize("samples", [200, 201])
+def test_one_period_of_a_sine_has_one_and_a_move_there_and_back_has_none(samples, rng):
+    """With its last sample or without; a move there and back in lines, as long as the sine, has another shape."""
+    time_s, turn = np.arange(samples) * 1e-3, rng.uniform(0, 2 * np.pi)
+    sine = 7 + rng.uniform(0.1, 30) * np.sin(2 * np.pi * 5.0 * time_s + turn)
+    assert strongest_Hz(sine, 1e-3) == pytest.approx(5.0, rel=1e-3)
+    there_and_back = np.clip(np.minimum(time_s, 0.2 - time_s) / rng.uniform(0.02, 0.08), 0, 1)
+    assert strongest_Hz(there_and_back, 1e-3) is None
 
 
 @pytest.mark.study

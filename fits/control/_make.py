@@ -15,6 +15,7 @@ import numpy as np
 import microid as m
 from fits.control._compensate import compensate
 from fits.control._gains import PID_SETTINGS, Given, replaced
+from fits.control._period import strongest_Hz
 from fits.control._tune import parameter_values, tune_controller
 from fits.control._tune_problem import Goal, Tuning
 from fits.control._tune_start import relay_start, slope_array, steepest_slope
@@ -26,8 +27,6 @@ from microid import control as ctl
 
 Feedforward = Literal["none", "static", "dynamic"]
 _FEWEST = 16
-# Spectra have so many times the bins that their samples ask for.
-_FINER = 8
 
 
 @dataclass(frozen=True)
@@ -153,21 +152,6 @@ def with_defaults(
             if setting.said:
                 said.append(setting.said.format(found[name]))
     return found, said
-
-
-def strongest_Hz(reference_um: np.ndarray, interval_s: float) -> float | None:
-    """Frequency of the strongest line of a reference, shape `(t,)`; None where no period stands out.
-
-    A line with less than one and a half periods counts as none: a single move looks the same.
-    """
-    n = len(reference_um)
-    size = np.abs(np.fft.rfft((reference_um - reference_um.mean()) * np.hanning(n), _FINER * n))
-    k = _FINER + int(np.argmax(size[_FINER:-1]))
-    if size[k] <= 0 or k < 1.5 * _FINER:
-        return None
-    left, here, right = np.log(np.maximum(size[k - 1 : k + 2], 1e-300))
-    bend = left - 2 * here + right
-    return float((k + (0.5 * (left - right) / bend if bend else 0.0)) / (_FINER * n * interval_s))
 
 
 @dataclass(frozen=True)

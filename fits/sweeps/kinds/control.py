@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 import microid as m
 from fits.control._gains import GAINS, PID_SETTINGS
-from fits.control._make import setup, strongest_Hz, with_defaults
+from fits.control._make import setup, with_defaults
+from fits.control._period import strongest_Hz
 from fits.control._tune_start import major_loop_slope, slope_array, steepest_slope
 from fits.io._errors import DataError, shown
 from fits.io._record import Reference
