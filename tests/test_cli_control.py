@@ -132,7 +132,7 @@ def test_it_says_what_feedback_is_worth(folder, tmp_path):
     # What the inverse of the whole stage leaves is told where another feedforward is used.
     led = json.loads(run(*words, "1e-12,0,0", "--feedforward", "dynamic", "--json").stdout)
     assert told["inverse_alone_um"] == pytest.approx(led["tracking"]["error_rms_um"], rel=1e-4)
-    assert " over all plants: --feedforward dynamic" in describe_control(told)
+    assert (told["over_plants_um"], told["strongest_Hz"]) == (pytest.approx(after), pytest.approx(25, rel=0.01))
     assert "alone leaves" not in describe_control(led)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from fits.control._alone import played_alone
 from fits.control._gains import printed_gains
 from fits.control._make import Loop, Made
+from fits.control._period import strongest_Hz
 from fits.control._tune_problem import Tuning
 from fits.io._json import strict
 from fits.io._length import length
@@ -49,6 +50,7 @@ def control_json(
     every, alone = loop.margins(made.controller), played_alone(loop, loop.ready)
     without = alone and [one[kept] for one in alone]
     inverse = inverse_um and _over_all(wanted[kept], [one[kept] for one in inverse_um])
+    every_um = [np.asarray(one.displacement_um)[kept] for one in played]
     found = {
         "schema": "microid.control/1",
         **about,
@@ -65,9 +67,11 @@ def control_json(
             "sensitivity_peak": max(float(one.sensitivity_peak) for one in every),
         },
         "tracking": _tracking(wanted[kept], moved[kept]),
+        "over_plants_um": _over_all(wanted[kept], every_um),
         "without_feedback": without and _tracking(wanted[kept], without[0]),
-        "worth": without and _worth(wanted[kept], [np.asarray(one.displacement_um)[kept] for one in played], without),
+        "worth": without and _worth(wanted[kept], every_um, without),
         "inverse_alone_um": inverse,
+        "strongest_Hz": strongest_Hz(wanted, loop.ready.interval_s),
         "step": _step(np.asarray(run.time_s), wanted, moved),
         "command_min_V": command.min(),
         "command_max_V": command.max(),
@@ -139,9 +143,9 @@ def describe_control(summary: Mapping[str, Any]) -> str:
     if without is not None:
         lines += [f"  without   {_tracked(without)}", f"feedback    {_said_of_worth(summary)}"]
     if (left := summary["inverse_alone_um"]) is not None:
-        lines.append(
-            f"inverse     that of the whole stage alone leaves {_long(left)} over all plants: --feedforward dynamic"
-        )
+        less = left < (1 - _SAME) * summary["over_plants_um"]
+        how = "less than this loop: --feedforward dynamic" if less else "no less than this loop"
+        lines.append(f"inverse     that of the whole stage alone leaves {_long(left)} over all plants, {how}")
     if (step := summary["step"]) is not None:
         time_s = step["settling_time_s"]
         settled = "not settled within the record" if time_s is None else f"settled in {time_s:.4g} s"
@@ -170,7 +174,11 @@ def _said_of_worth(summary: Mapping[str, Any]) -> str:
     if share >= _PAYS:
         return does
     command = f"microid compensate{' --dynamic' if summary['feedforward'] == 'dynamic' else ''}"
-    return f"{does}; {_ALONE.format(command, 'as well' if share >= -_SAME else 'better')}"
+    said = f"{does}; {_ALONE.format(command, 'as well' if share >= -_SAME else 'better')}"
+    period_Hz = summary["strongest_Hz"]
+    if summary["controller"] == "resonant" or period_Hz is None:
+        return said
+    return f"{said}; for what repeats at {period_Hz:.4g} Hz there is --controller resonant"
 
 
 def _long(size_um: float | None) -> str:
