@@ -13,7 +13,7 @@ import numpy as np
 from fits.io._length import length
 from fits.io._limits import Extreme
 from fits.io._summary import AbstractSummary
-from fits.loop._report_words import UNSEEN, is_seen
+from fits.loop._report_words import unseen
 from fits.loop._result import ParameterEstimate
 from fits.stage._uncertainty import StageUncertainty
 from fits.stats._metrics import TWO_SIDED_95
@@ -256,8 +256,8 @@ class Diagnosis(AbstractSummary):
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
                 lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the {whole}")
             for each in cause.shown:
-                if not is_seen(each.value, each.lower, each.upper):
-                    lines.append(f"    {each.name:24} {UNSEEN}")
+                if words := unseen(each.value, each.lower, each.upper):
+                    lines.append(f"    {each.name:24} {words}")
                     continue
                 unit = "" if each.unit == "1" else f" {each.unit}"
                 below, above = each.value - each.lower, each.upper - each.value

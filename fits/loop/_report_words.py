@@ -110,19 +110,34 @@ def _verdict(report: Mapping[str, Any]) -> str:
 
 # A parameter at a bound is put 1e-6 of its scale away from it: nothing is known of one that may be ten scales away.
 _AT_BOUND = 1e-7
-UNSEEN = "not seen in these runs"
+# An interval from so small a part of the value to so many times it says nothing, nor does one of such a width.
+_OPEN, _ANYTHING = 100.0, 1e9
+UNSEEN, UNDETERMINED = "at its bound, not seen in these runs", "not determined by these runs"
 
 
-def is_seen(value: float | None, lower: float | None, upper: float | None) -> bool:
-    """Whether runs show a parameter: not one at a bound whose 95 % interval is open on the other side.
+def unseen(value: float | None, lower: float | None, upper: float | None) -> str:
+    """Say that runs do not show a parameter, by its value and 95 % interval; nothing of one that they show.
 
-    An interval of less than a decade says where it is.
+    They do not show one at a bound whose interval is open on the other side, nor one that may be anything. An
+    interval of less than a decade says where it is.
     """
-    if value is None or lower is None or upper is None or not lower < value < upper < inf:
-        return True
-    if lower > 0 and upper < 10 * lower:
-        return True
-    return min(value - lower, upper - value) >= _AT_BOUND * (upper - lower)
+    # In JSON an open end is none, as is one that is not known, and both of what has no interval at all.
+    if value is None or (lower is None and upper is None):
+        return ""
+    lower, upper = -inf if lower is None else lower, inf if upper is None else upper
+    if not lower <= value <= upper:
+        return ""
+    smaller, larger = sorted((abs(lower), abs(upper)))
+    if lower == upper or (lower * upper > 0 and larger < 10 * smaller):
+        return ""
+    width = upper - lower
+    near = _AT_BOUND * (width if width < inf else abs(value))
+    # What is zero at its bound is not there, and how large it may be is told.
+    if min(value - lower, upper - value) <= near and (value != 0 or width > _ANYTHING):
+        return UNSEEN
+    decades = 0 < lower < value / _OPEN and upper > _OPEN * value
+    anything = _ANYTHING < width < inf or -lower == upper == inf
+    return UNDETERMINED if decades or anything else ""
 
 
 def parameter_lines(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -131,8 +146,8 @@ def parameter_lines(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _parameter_row(one: Mapping[str, Any]) -> tuple[str, str, str, str]:
-    if not is_seen(one["value"], one["lower"], one["upper"]):
-        return one["name"], UNSEEN, "", ""
+    if words := unseen(one["value"], one["lower"], one["upper"]):
+        return one["name"], words, "", ""
     sd = "unknown" if one["sd"] is None else format(one["sd"], ".2g")
     interval = f"(95 % {_value(one, 'lower')}..{_value(one, 'upper')})"
     return one["name"], f"{_value(one)} ± {sd}", interval, "" if one["unit"] == "1" else one["unit"]

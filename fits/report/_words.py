@@ -7,7 +7,7 @@ import numpy as np
 
 from fits.diagnosis._result import SMALLEST_P, Diagnosis, FoundCause, RunView
 from fits.io import _length
-from fits.loop._report_words import UNSEEN, is_seen
+from fits.loop._report_words import unseen
 from fits.loop._result import ParameterEstimate
 from microid.effects import EFFECTS, card_of
 
@@ -61,8 +61,8 @@ def number(value: float, digits: int = 3) -> str:
 
 def estimate(parameter: ParameterEstimate) -> tuple[str, str, str]:
     """Write estimate, standard deviation and 95 % interval, rounded to two digits of the standard deviation."""
-    if not is_seen(parameter.value, parameter.lower, parameter.upper):
-        return UNSEEN, NONE, NONE
+    if words := unseen(parameter.value, parameter.lower, parameter.upper):
+        return words, NONE, NONE
     sd = parameter.sd
     size = abs(parameter.value) if math.isfinite(parameter.value) else 0.0
     if not (math.isfinite(sd) and sd >= 1e-6) or max(size, sd) >= 1e6:
