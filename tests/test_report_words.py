@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from _diagnosis import KINDS, cause, diagnosis
 
-from fits import ParameterEstimate
 from fits.diagnosis._conclude import not_named
+from fits.diagnosis._experiment import _purpose
 from fits.diagnosis._result import Gain
-from fits.loop._report_words import UNSEEN, _row, parameter_lines
+from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
-from fits.report._words import NONE, estimate, headline, length, number, plain, spread, verdict_sentence
+from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
 from microid.effects import EFFECTS, Scales, extend
 
 SIZES_um = (0.0471, 0.0123, 0.04709, 0.0470999, 0.9, np.nan)
@@ -307,22 +307,17 @@ def test_one_suspect_is_not_spoken_of_as_several():
     assert not_named(["creep", "load_change"], "w").endswith("none of them is named")
 
 
-def test_a_parameter_at_its_bound_that_nothing_shows_gets_no_numbers(rng):
-    """A time constant of nothing is seen where the interval is short, and not where it may be anything."""
-    open_end = ParameterEstimate("driver.time_constant_s", "s", 2e-9, 5.7, 1e-9, 22.4)
-    short = replace(open_end, sd=1e-6, upper=2e-6)
-    at_zero, onset = (
-        replace(open_end, value=0.0, lower=0.0),
-        replace(open_end, value=0.01 + 1e-12, lower=0.01, upper=0.015),
-    )
-    free = replace(open_end, value=1.0)
-    for one, seen in ((open_end, False), (short, True), (at_zero, True), (onset, True), (free, True)):
-        (line,) = parameter_lines([vars(one)])
-        assert (UNSEEN in line) != seen
-        assert (UNSEEN in estimate(one)) != seen
-        found = diagnosis(rng)
-        found = replace(found, causes=(replace(found.causes[0], parameters=(one,)),), baseline_parameters=(one,))
-        assert (UNSEEN in found.summary()) != seen
-        assert (UNSEEN in stage_parameters(found)[1]) != seen
-        if not seen:
-            assert "22.4" not in line + found.summary() + " ".join(stage_parameters(found)[1])
+@pytest.mark.parametrize("present_z", [0.0, 2.0])
+def test_what_to_play_where_no_effect_was_found_does_not_suppose_one(rng, present_z):
+    """The report said that no effect was found, and asked for an experiment on the one that was suspected."""
+    purpose = _purpose(("load_change",), 6.0, present_z, "")
+    assert re.search("by 6.0 standard deviations" if present_z == 0 else "3.0 times as clearly", purpose)
+    ahead = replace(diagnosis(rng).next_experiment, purpose=purpose, separates=("load_change",))
+    none, open_ = (replace(diagnosis(rng, kind), next_experiment=ahead) for kind in ("no_effect", "unexplained"))
+    step = next_steps(none)[1][0]
+    assert step.startswith("To be surer that there is no effect, play next_experiment.csv")
+    assert "If the rig has load change after all" in step
+    assert next_steps(open_)[1][0].startswith("Play next_experiment.csv")
+    for told in (none.summary(), text_of(none)):
+        assert purpose in told
+        assert "suspect" not in told

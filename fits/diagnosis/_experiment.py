@@ -196,11 +196,13 @@ def _purpose(names: tuple[str, ...], z: float, present: float, column: str) -> s
     *others, last = (name.replace("_", " ") for name in names)
     if not others:
         # Evidence that was sought, not supposed, is another number: the two are not to stand side by side.
-        if present < 1.0:
-            return f"It would show {last} of the size that is suspected by {z:.1f} standard deviations."
-        return (
-            f"It would show {last} of the size that is suspected {z / present:.1f} times as clearly as these records."
+        by = (
+            f"by {z:.1f} standard deviations"
+            if present < 1.0
+            else f"{z / present:.1f} times as clearly as these records"
         )
+        # Whether it is there is what the verdict says, and not this sentence.
+        return f"If the rig has {last} after all, of the size that fits these records best, this would show it {by}."
     listed = f"{', '.join(others)} and {last}"
     if z < _TOLD_APART and column:
         return f"No program within the limits tells {listed} apart by itself: record this one with a further column."

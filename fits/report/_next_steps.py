@@ -35,8 +35,9 @@ def next_steps(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         fitted = [run.source for run in diagnosis.runs if run.fitted.any()]
         aside = [("--holdout", run.source) for run in diagnosis.runs if not run.fitted.any()]
         again = ["microid", "diagnose", *fitted, "answer.csv", *chain(*aside), "--out", "again"]
-        words = "Play next_experiment.csv on the rig, record answer.csv, and diagnose all runs together"
-        steps.append((f"{words}. {ahead.purpose}", shlex.join(again)))
+        words = "lay next_experiment.csv on the rig, record answer.csv, and diagnose all runs together"
+        begin = "To be surer that there is no effect, p" if diagnosis.verdict == "no_effect" else "P"
+        steps.append((f"{begin}{words}. {ahead.purpose}", shlex.join(again)))
     elif diagnosis.verdict == "unexplained":
         steps.append(("Record a run at another speed, with holds and with the temperature, and diagnose again.", ""))
     return steps
