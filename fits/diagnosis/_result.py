@@ -13,6 +13,7 @@ import numpy as np
 from fits.io._length import length
 from fits.io._limits import Extreme
 from fits.io._summary import AbstractSummary
+from fits.loop._line_words import amplitude
 from fits.loop._report_words import unseen
 from fits.loop._result import ParameterEstimate
 from fits.stage._uncertainty import StageUncertainty
@@ -104,9 +105,7 @@ _ENTRY = re.compile(r"(\w+)(?:\[(\d+)\])?(.*)")
 
 
 def _amplitude(name: str, cosine: ParameterEstimate, sine: ParameterEstimate) -> ParameterEstimate:
-    """Amplitude of a line, with the standard deviation along it; that of no line is the larger of the two."""
-    size = math.hypot(cosine.value, sine.value)
-    sd = math.hypot(cosine.value * cosine.sd, sine.value * sine.sd) / size if size > 0 else max(cosine.sd, sine.sd)
+    size, sd = amplitude((cosine.value, cosine.sd), (sine.value, sine.sd))
     return ParameterEstimate(
         name, cosine.unit, size, sd, max(size - TWO_SIDED_95 * sd, 0.0), size + TWO_SIDED_95 * sd
     )
