@@ -1,5 +1,6 @@
 """The page of a folder, asked for as a browser asks, and opened in one where there is one."""
 
+import base64
 import functools
 import json
 import re
@@ -8,6 +9,7 @@ import threading
 import urllib.error
 import urllib.request
 from http.server import ThreadingHTTPServer
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,17 +17,22 @@ from _browser import browser, opened
 from _command import refused, run
 from _diagnosis import diagnosis
 from _seed import seed_of
+from _sweeps import parsed, small
 from test_diagnosis_report import Page
 
 from fits import default_stage, save_model
 from fits.cli.serve import _Pages
 from fits.report._diagnosis import report_html
+from fits.sweeps._run import run_sweep
+from fits.sweeps._show import summarise
 from fits.sweeps._store import ABOUT, LEDGER
+
+ROWS = 12
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    """A folder of results on a free port, and its address."""
+def folder_and_address(tmp_path_factory):
+    """A folder of results, and its address on a free port."""
     folder = tmp_path_factory.mktemp("results")
     report = report_html(diagnosis(np.random.default_rng(seed_of("test_serve")), count=1))
     for name in ("first", "se & cond"):
@@ -35,14 +42,31 @@ def address(tmp_path_factory):
     save_model(folder / "stage.json", default_stage(), None, {})
     shutil.copy(folder / "stage.json", folder / "first" / "extended.json")
     (folder / "other.json").write_text(json.dumps({"schema": "another/1"}))
+    run_sweep(parsed(small(1, ROWS)), folder / "whole")
     # A sweep that is broken says so in its place.
     (folder / "sweep" / LEDGER).mkdir(parents=True)
     (folder / "sweep" / ABOUT).write_text("{")
     server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Pages, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}/"
+    yield folder, f"http://127.0.0.1:{server.server_port}/"
     server.shutdown()
     server.server_close()
+
+
+@pytest.fixture(scope="module")
+def address(folder_and_address):
+    return folder_and_address[1]
+
+
+@pytest.fixture(scope="module")
+def swept(folder_and_address):
+    """The folder of a sweep that is whole."""
+    return folder_and_address[0] / "whole"
+
+
+def asked(address):
+    with urllib.request.urlopen(address) as answer:
+        return answer.read().decode()
 
 
 def status_of(address, **headers):
@@ -54,25 +78,47 @@ def status_of(address, **headers):
 
 
 def test_results_stand_side_by_side_for_this_machine_alone(address):
-    with urllib.request.urlopen(address) as answer:
-        text = answer.read().decode()
+    text = asked(address)
     page = Page(text)
     assert text.count("<iframe") == 2
-    assert text.count("<article") == 4
+    assert text.count("<article") == 5
     # A model by itself is shown, and that of a diagnosis by its report.
     for words in ("stage.json", "natural_frequency_Hz", "first/report.html", "se & cond/report.html", ABOUT):
         assert words in page.text
     assert "extended.json" not in page.text
-    assert [status_of(address + link) for link in page.links if not link.startswith("data:")] == [200] * 6
+    assert [status_of(address + link) for link in page.links if not link.startswith("data:")] == [200] * 7
     # Each opens by its name, says when it was written, and words, whose lines are long, have the whole width.
-    for name, place in (("Model stage.json", "stage.json"), ("Sweep sweep", "sweep/about.json")):
+    for name, place in (("Model stage.json", "stage.json.html"), ("Sweep sweep", "sweep/about.json.html")):
         assert f'<h2><a href="{place}">{name}</a></h2>' in text
-    assert len(re.findall(r"· \d{4}-\d\d-\d\d \d\d:\d\d</p>", text)) == 4
-    assert text.count('<article class="whole">') == text.count('<pre class="words">') == 2
+    assert len(re.findall(r"· \d{4}-\d\d-\d\d \d\d:\d\d</p>", text)) == 5
+    assert text.count('<article class="whole">') == text.count('<pre class="words">') == 3
     assert re.search(r"\.gallery \.whole \{ grid-column: 1 / -1", text)
     assert status_of(address, Host="rebound.example:80") == 404
     for inside in ("first/", "sweep/ledger", "../secret", "%2e%2e/secret"):
         assert status_of(address + inside) == 404
+
+
+def test_a_model_and_a_sweep_open_as_pages_and_not_as_json(address, swept):
+    """A sweep that is whole has its figures, its pictures and its text; what is broken says so."""
+    page, model, broken = (
+        asked(address + f"{name}.html") for name in ("whole/about.json", "stage.json", "sweep/about.json")
+    )
+    figures = summarise(swept)["outputs"]["stroke_um"]
+    assert re.search(rf"stroke_um +{figures['min']:.4g} ", Page(page).text)
+    for words in ("<h1>Sweep whole</h1>", "kind = &#34;simulate&#34;", f" of {ROWS} rows done"):
+        assert words in page
+    drawn = [base64.b64decode(one).decode() for one in re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page)]
+    # Parallel coordinates, and one map for the only pair of parameters.
+    assert len(drawn) == 2
+    assert all(ElementTree.fromstring(one).tag.endswith("svg") for one in drawn)
+    assert "natural_frequency_Hz" in Page(model).text
+    assert "<h1>Model stage.json</h1>" in model
+    assert "about.json is broken" in Page(broken).text
+    assert "<img" not in broken
+    # No other file has such a page, and nothing was written for these.
+    for other in ("other.json", "none.json", "whole/sweep.toml", "first/report"):
+        assert status_of(f"{address}{other}.html") == (200 if other == "first/report" else 404)
+    assert not list(swept.parent.rglob("*.json.html"))
 
 
 def test_what_cannot_be_served_is_said(address, tmp_path):
@@ -84,10 +130,10 @@ def test_what_cannot_be_served_is_said(address, tmp_path):
 @pytest.mark.skipif(browser() is None, reason="there is no Chromium to open the page with")
 @pytest.mark.parametrize("width_px", [390, 1200])
 def test_a_browser_shows_results_side_by_side_where_there_is_room(address, tmp_path, width_px):
-    with urllib.request.urlopen(address) as answer:
-        text = answer.read().decode().replace("<head>", f'<head><base href="{address}">')
-    seen = opened(text, width_px, tmp_path)
-    assert (seen["problems"], seen["broken"]) == ([], 0)
-    assert seen["needed"] <= width_px
+    for inner in ("whole/about.json.html", "stage.json.html", ""):
+        text = asked(address + inner).replace("<head>", f'<head><base href="{address}">')
+        seen = opened(text, width_px, tmp_path)
+        assert (seen["problems"], seen["broken"]) == ([], 0)
+        assert seen["needed"] <= width_px
     lefts = {round(left) for left in seen["lefts"]}
     assert len(lefts) == (1 if width_px < 500 else 2)

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from fits.report._control import control_json, describe_control
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json
-    from fits.report._gallery import gallery_html
+    from fits.report._gallery import gallery_html, result_html
     from fits.report._machining import budget_json, sensitivity_json
     from fits.report._model_words import model_kind, model_numbers, model_words
     from fits.report._page import write_page

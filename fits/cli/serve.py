@@ -24,8 +24,8 @@ class _Pages(SimpleHTTPRequestHandler):
         place = Path(self.translate_path(self.path))
         if name not in (_HERE, "localhost") or (place.is_dir() and place != Path(self.directory)):
             self.send_error(HTTPStatus.NOT_FOUND)
-        elif place.is_dir():
-            content = late.gallery_html(place).encode()
+        elif page := self._made(place):
+            content = page.encode()
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(content)))
@@ -33,6 +33,13 @@ class _Pages(SimpleHTTPRequestHandler):
             self.wfile.write(content)
         else:
             super().do_GET()
+
+    @staticmethod
+    def _made(place: Path) -> str | None:
+        """The page of the folder, or of a result in it that has none of its own; None for a file that is there."""
+        if place.is_dir():
+            return late.gallery_html(place)
+        return late.result_html(place.with_suffix("")) if not place.exists() and place.suffix == ".html" else None
 
     def end_headers(self) -> None:
         """Let a browser keep nothing: results change."""

@@ -63,8 +63,16 @@ def _width_px(picture: Path) -> float | None:
         return int.from_bytes(file.read(20)[16:20], "big") * 96 / DOTS_PER_in
 
 
+def page_html(title: str, words: str, pictures: Iterable[tuple[str, str, float | None]], sweep: str = "") -> str:
+    """Write a page: a title, words as a terminal shows them, pictures, and the text of a sweep, which may be opened.
+
+    Of each picture the name, the address and the width in CSS pixels are given; None for one that says it itself.
+    """
+    shown = {"title": printable(title), "words": words, "pictures": list(pictures), "sweep": sweep}
+    return environment().get_template("page.html").render(shown)
+
+
 def write_page(folder: Path, title: str, words: str, pictures: Iterable[Path]) -> None:
     """Write `index.html` into the folder of some pictures: a title, words as a terminal shows them, the pictures."""
-    drawn = [(picture.name, _width_px(picture)) for picture in pictures]
-    shown = {"title": printable(title), "words": words, "pictures": drawn}
-    (folder / "index.html").write_text(environment().get_template("page.html").render(shown), encoding="utf-8")
+    drawn = [(picture.name, picture.name, _width_px(picture)) for picture in pictures]
+    (folder / "index.html").write_text(page_html(title, words, drawn), encoding="utf-8")
