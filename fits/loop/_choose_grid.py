@@ -132,7 +132,7 @@ def _stroke(run: Run) -> float:
     if together < 0:
         raise DataError(
             f"{run.record.source}: the displacement falls where the voltage rises, which no density of relays does; "
-            "change the sign of one of the two columns"
+            "change the sign of one of the two columns, or name them the other way round if they are exchanged"
         )
     # Measured loops have -0.9 to -1.0, see `_leads`, and 0.8 to 1.0 with their columns exchanged.
     if _leads(voltage, displacement) > 0.5:
