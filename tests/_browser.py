@@ -31,6 +31,8 @@ def opened(text, width_px, folder, act="null"):
         "document.getElementById('seen').textContent = JSON.stringify({acted, width: w.innerWidth,"
         "needed: d.documentElement.scrollWidth, problems: w.problems,"
         "lefts: [...d.querySelectorAll('article')].map(one => one.getBoundingClientRect().left),"
+        "sideways: [...d.querySelectorAll('.scroll')].filter(one => one.scrollWidth > one.clientWidth)"
+        ".map(one => one.textContent),"
         "pictures: [...d.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().width),"
         "broken: [...d.images].filter(i => !i.complete || !i.naturalWidth).length}); });"
         f"frame.srcdoc = {page};</script></body>",

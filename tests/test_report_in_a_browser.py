@@ -2,12 +2,14 @@
 
 import math
 import re
+from dataclasses import replace
 
 import pytest
 from _browser import browser, opened, printed
 from _diagnosis import KINDS, diagnosis
 from PIL import Image
 
+from fits import ParameterEstimate
 from fits.report._diagnosis import report_html
 from fits.report._page import write_page
 
@@ -19,8 +21,15 @@ SHEET_px = [math.floor((side - 2 * MARGIN_mm) / 25.4 * 96) for side in A4_mm]
 
 @pytest.mark.parametrize("width_px", [390, 1200])
 def test_a_browser_shows_the_report_without_scrolling_sideways(rng, tmp_path, width_px):
-    page = report_html(diagnosis(rng, "unexplained"))
+    made = diagnosis(rng, "unexplained")
+    # As a fit gives them: the units of such long ones were beyond the edge of their table.
+    given = {"value": 0.00060133, "sd": 2.9e-6, "lower": 0.00059567, "upper": 0.00060702}
+    long = ParameterEstimate("driver.time_constant_s", "s", **given)
+    rare = ParameterEstimate("driver.least_s", "s", **{key: -1.2345e-9 * x for key, x in given.items()})
+    page = report_html(replace(made, baseline_parameters=(long, rare), extended_parameters=(long, rare)))
     seen = opened(page, width_px, tmp_path)
+    assert seen["sideways"] == []
+    assert "driver time constant (s)" in page
     assert seen["width"] == width_px
     assert seen["needed"] <= width_px
     assert seen["problems"] == []

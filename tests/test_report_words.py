@@ -246,11 +246,11 @@ def test_commands_name_the_runs_and_those_held_out(rng):
     assert partly_fitted(runs[1:], True) == ""
     row = "3000", "100", number(np.ptp(first.time_s)), number(np.ptp(first.voltage_V)), "voltage, displacement"
     assert runs_read(runs)[0][1:6] == row
-    warm = replace(runs[1], extra=("temperature_degC",), time_s=runs[1].time_s ** 1.1)
+    warm = replace(runs[1], extra=("temperature_degC", "pump_on", "path_V"), time_s=runs[1].time_s ** 1.1)
     rows = runs_read((runs[0], warm), ("data/slow.csv", "more/a b.csv"))
     assert [one[0] for one in rows] == ["data/slow.csv", "more/a b.csv"]
     assert rows[1][2].startswith("uneven")
-    assert rows[1][5] == "voltage, displacement, temperature degC"
+    assert rows[1][5] == "voltage, displacement, temperature, pump on"
     assert "data/slow.csv" in report_html(found, "", ("data/slow.csv", "more/a b.csv"))
     assert [one[0] for one in runs_read(runs, ("elsewhere.csv",))] == ["slow.csv", "a b.csv"]
     silent = replace(found, verdict="unexplained", next_experiment=None)
@@ -260,11 +260,12 @@ def test_commands_name_the_runs_and_those_held_out(rng):
 def test_parameters_stand_beside_each_other(rng):
     made = diagnosis(rng)
     heads, row = stage_parameters(made)
-    assert heads == ("Parameter", "Plain", "95 % interval", "Extended", "95 % interval", "Unit")
-    frequency = ("mechanics natural frequency", "149.80", "149.39 to 150.21", "150.020", "149.950 to 150.090", "Hz")
+    assert heads == ("Parameter", "Plain", "95 % interval", "Extended", "95 % interval")
+    name = "mechanics natural frequency (Hz)"
+    frequency = (name, "149.80", "149.39 to 150.21", "150.020", "149.950 to 150.090")
     assert row == frequency
     # Without a cause both are the same.
-    assert stage_parameters(diagnosis(rng, "no_effect"))[1] == (*frequency[:3], "Hz")
+    assert stage_parameters(diagnosis(rng, "no_effect"))[1] == frequency[:3]
 
 
 def test_errors_of_a_fit_are_in_the_unit_that_they_ask_for():

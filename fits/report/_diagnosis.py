@@ -105,7 +105,7 @@ def _with_words() -> Environment:
         made.filters[name] = getattr(_words, name)
     made.filters["length_of"] = length
     made.filters["without_dot"] = lambda text: text.rstrip(".")
-    made.filters["parameter_row"] = lambda one: (parameter_name(one), *estimate(one), shown_unit(one.unit) or "1")
+    made.filters["parameter_row"] = lambda one: (parameter_name(one), *estimate(one))
     made.tests["finite"] = math.isfinite
     made.globals["SIGMA"] = SIGMA
     return made

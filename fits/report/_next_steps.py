@@ -8,6 +8,8 @@ from itertools import chain
 import numpy as np
 
 from fits.diagnosis._result import Diagnosis, RunView
+from fits.io.columns import COLUMNS
+from fits.io.columns.path import PATH
 from fits.report._words import (
     NOISY,
     NONE,
@@ -18,7 +20,6 @@ from fits.report._words import (
     parameter_name,
     percent,
     plain,
-    shown_unit,
 )
 from microid.effects import AbstractEffect, card_of
 
@@ -98,6 +99,7 @@ def _is_own(diagnosis: Diagnosis, name: str) -> bool:
 def runs_read(runs: Sequence[RunView], paths: Sequence[str] = ()) -> list[tuple[str, ...]]:
     """Name or path, samples, rate, duration in s, range of the command in V, channels and use of every run.
 
+    The path of the command, which is no channel of a file but made of its voltages, is left out.
     Paths are those that were given, in the order of the runs.
     """
     rows: list[tuple[str, ...]] = []
@@ -106,9 +108,14 @@ def runs_read(runs: Sequence[RunView], paths: Sequence[str] = ()) -> list[tuple[
         use = "held out" if share == 0 else "fitted" if share == 1 else f"{percent(share)} fitted"
         span_s, volts = (number(float(np.ptp(one))) if one.size else NONE for one in (run.time_s, run.voltage_V))
         name = paths[k] if len(paths) == len(runs) and paths[k].endswith(run.source) else run.source
-        channels = ", ".join(("voltage", "displacement", *(plain(one) for one in run.extra)))
+        channels = ", ".join(("voltage", "displacement", *(_channel(key) for key in run.extra if key != PATH)))
         rows.append((name or NONE, f"{run.time_s.size}", _rate_Hz(run.time_s), span_s, volts, channels, use))
     return rows
+
+
+def _channel(key: str) -> str:
+    """Name a further column, without its unit where that is known."""
+    return plain(next((each.quantity.stem for each in COLUMNS.values() if each.quantity.column == key), key))
 
 
 def _rate_Hz(time_s: np.ndarray) -> str:
@@ -135,10 +142,8 @@ def stage_parameters(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
     """Heads and rows of a table: what was fitted of the plain stage, and beside causes of both, with intervals."""
     after = {one.name: one for one in diagnosis.extended_parameters if diagnosis.causes}
     sides = ("Plain", "Extended") if after else ("Estimate",)
-    rows: list[tuple[str, ...]] = [
-        ("Parameter", *(head for side in sides for head in (side, "95 % interval")), "Unit")
-    ]
+    rows: list[tuple[str, ...]] = [("Parameter", *(head for side in sides for head in (side, "95 % interval")))]
     for one in diagnosis.baseline_parameters:
         cells = (cell for each in (one, after.get(one.name, one))[: len(sides)] for cell in estimate(each)[::2])
-        rows.append((plain(parameter_name(one).replace(".", " ")), *cells, shown_unit(one.unit) or "1"))
+        rows.append((parameter_name(one), *cells))
     return rows

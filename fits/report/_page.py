@@ -13,8 +13,9 @@ from fits.plots._style import DOTS_PER_in
 
 # Letters at most by which a line that goes on is set in.
 _MOST_INDENT = 16
-# A number and what it counts, in text and outside of commands.
-_QUANTITY = re.compile("(?<=\\d) (?=(?:%|[pnµum]?m|k?Hz|m?s|k?V|\N{GREEK SMALL LETTER SIGMA})(?![\\w/]))")
+# A number and what it counts, and a power of ten, in text and outside of commands.
+_UNIT = "(?<=\\d) (?=(?:%|[pnµum]?m|k?Hz|m?s|k?V|\N{GREEK SMALL LETTER SIGMA})(?![\\w/]))"
+_QUANTITY = re.compile(f"{_UNIT}|(?<=\\d) (?=\N{MULTIPLICATION SIGN} 10)|(?<=\\d \N{MULTIPLICATION SIGN}) (?=10)")
 
 
 def environment() -> Environment:

@@ -86,9 +86,10 @@ def sigmas(z: float) -> str:
 
 
 def parameter_name(parameter: ParameterEstimate) -> str:
-    """Name a parameter in words, without the unit, which stands beside it."""
+    """Name a parameter in words, with its unit if it has one."""
     suffix = "_" + parameter.unit.replace("/", "_per_").replace("^", "")
-    return plain(parameter.name.removesuffix(suffix))
+    unit = shown_unit(parameter.unit)
+    return plain(parameter.name.removesuffix(suffix).replace(".", " ")) + (f" ({unit})" if unit else "")
 
 
 def percent(share: float) -> str:
