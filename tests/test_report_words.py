@@ -16,6 +16,7 @@ from fits.loop._report_words import _row
 from fits.report._diagnosis import _gained, report_html
 from fits.report._diagnosis_json import diagnosis_json
 from fits.report._next_steps import next_steps, partly_fitted, runs_read, stage_parameters
+from fits.report._page import unbroken
 from fits.report._words import NONE, headline, length, number, plain, spread, verdict_sentence
 from microid.effects import EFFECTS, Scales, extend
 
@@ -197,6 +198,9 @@ def test_no_line_ends_between_a_number_and_its_unit(rng):
     breaks = re.findall(quantity, text)
     assert len(breaks) > 20
     assert set(breaks) == {"\N{NO-BREAK SPACE}"}
+    times, space = "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
+    told = unbroken(f"1.2 {times} 10⁻⁵ or below 10⁻⁹, 3 {times} 4")
+    assert told == f"1.2{space}{times}{space}10⁻⁵ or below{space}10⁻⁹, 3 {times} 4"
 
 
 def test_numbers_of_an_experiment_stand_once_and_of_one_suspect_not_beside_its_evidence(rng):

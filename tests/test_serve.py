@@ -111,6 +111,11 @@ def test_a_model_and_a_sweep_open_as_pages_and_not_as_json(address, swept):
     # Parallel coordinates, and one map for the only pair of parameters.
     assert len(drawn) == 2
     assert all(ElementTree.fromstring(one).tag.endswith("svg") for one in drawn)
+    # Cells have edges of their own colour, so that no white lines are between them.
+    cells = re.search(r'<g id="QuadMesh_1">(.*?)</g>', drawn[1], re.DOTALL)[1]
+    colours = re.findall(r"fill: (#\w+)(?:; stroke: (#\w+))?", cells)
+    assert len(colours) > 5
+    assert all(inside == edge for inside, edge in colours)
     assert "natural_frequency_Hz" in Page(model).text
     assert "<h1>Model stage.json</h1>" in model
     assert "about.json is broken" in Page(broken).text

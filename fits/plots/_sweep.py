@@ -124,7 +124,8 @@ def _heat(rows: _Rows, pair: tuple[str, str]) -> Figure:
         mean = np.where(count > 0, total / np.maximum(count, 1), math.nan)
     picture, axes = panels(WIDE_in / 2, _HIGH_in)
     corners = [10**ends if log else ends for ends, log in zip(edges, logs, strict=True)]
-    drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis")
+    # Without edges of their own, cells have white lines between them in SVG and PDF.
+    drawn = axes.pcolormesh(*corners, mean.T, cmap="viridis", edgecolors="face", linewidth=0.3)
     if not done.all():
         there = (rows.swept[name][~done] for name in pair)
         # Whole at the rim, too.

@@ -13,9 +13,10 @@ from fits.plots._style import DOTS_PER_in
 
 # Letters at most by which a line that goes on is set in.
 _MOST_INDENT = 16
-# A number and what it counts, and a power of ten, in text and outside of commands.
+# A number and what it counts, and a power of ten with what is before it, in text and outside of commands.
 _UNIT = "(?<=\\d) (?=(?:%|[pnµum]?m|k?Hz|m?s|k?V|\N{GREEK SMALL LETTER SIGMA})(?![\\w/]))"
-_QUANTITY = re.compile(f"{_UNIT}|(?<=\\d) (?=\N{MULTIPLICATION SIGN} 10)|(?<=\\d \N{MULTIPLICATION SIGN}) (?=10)")
+_POWER = "(?<=\\d) (?=\N{MULTIPLICATION SIGN} 10)|(?<=\\d \N{MULTIPLICATION SIGN}) (?=10)|(?<=below) (?=10)"
+_QUANTITY = re.compile(f"{_UNIT}|{_POWER}")
 
 
 def environment() -> Environment:
