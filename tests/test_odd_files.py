@@ -53,6 +53,7 @@ ODD = {
     "noon": clocked(HEAD, [f"{at.replace('23:', '11:')} AM" if at[0] == "2" else f"12{at[2:]} PM" for at in DAY]),
     "day and time": clocked(HEAD, [f"11/25/2026 {9 + (at[0] == '0')}:{at[3:]}" for at in DAY]),
     "minutes of a spreadsheet": clocked("Time,Voltage,Displacement\n", [at[3:] for at in DAY]),
+    "ISO without separators": clocked(HEAD, [at.replace("-", "").replace(":", "") + "+0100" for at in clock(T)]),
     "date beside": "Scope 3\n\n" + clocked("Date,Time,U [V],Position [um]\n", [f"2026-11-25,{at}" for at in DAY]),
     "names of two lines": '"Time\n(s)","Voltage\n(V)","Position\n(um)"\n' + rows(T, V, Y),
     "names with spaces": "Time (s)   Voltage (V)  Position (um)\n" + rows(T, V, Y, separator="   "),

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 
 from fits.io._quantity import FloatArray
 
-_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)? ?(Z|[+-]\d\d:?\d\d)?")
+_ISO = re.compile(
+    r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?|\d{8}T\d{4}(\d\d([.,]\d+)?)?) ?(Z|[+-]\d\d(:?\d\d)?)?"
+)
 # A time of day behind a date of any kind or none; what has no hours has a fraction, as spreadsheets write it.
 _DAY = re.compile(
     r"(?P<date>[\d./-]{6,10}[ T]+)?(?:(?P<hour>\d{1,2}):(?=\d\d:)|(?=\d\d:\d\d[.,]))"
