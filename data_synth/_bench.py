@@ -55,7 +55,7 @@ class Record:
     other_um: FloatArray | None = None
 
     def columns(self) -> dict[str, FloatArray]:
-        """What goes into the CSV: the columns by their names, each of shape (n,)."""
+        """What goes into the CSV: the columns by their names, which end in their units, each of shape (n,)."""
         columns = {name: getattr(self, name) for name in ("time_s", "voltage_V", "displacement_um")}
         for name in ("temperature_C", "other_um"):
             if getattr(self, name) is not None:

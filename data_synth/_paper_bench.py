@@ -191,7 +191,7 @@ class PaperBench:
         return rest[:, -1], self._read(rest)
 
     def step(self, command_V: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacements and what the sensors read, one interval later, from commands of shape `(benches,)`."""
+        """Displacements and readings in um, one interval later, from commands in V of shape `(benches,)`."""
         command = np.minimum(np.maximum(command_V, 0.0), self.piezo.upper_V)[:, None]
         voltage_V = command + (self._voltage_V[:, None] - command) * self._decay
         self._voltage_V = voltage_V[:, -1]

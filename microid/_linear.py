@@ -44,9 +44,9 @@ class LinearSystem(eqx.Module):
     read
         What the states add to the output, `c`, shape `(n,)`.
     gain
-        Static gain `g`.
+        Static gain `g`, output per input.
     offset
-        Output at rest under no input, `y_0`.
+        Output at rest under no input, `y_0`, in the unit of the output.
     """
 
     rate_per_s: Float[Array, "n n"] = eqx.field(converter=_as_inexact)

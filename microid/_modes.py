@@ -174,7 +174,7 @@ class HystereticModes(eqx.Module):
     def respond_periodically(
         self, voltage_V: Float[Array, "t m"], interval_s: float, oversampling: int = 8
     ) -> Float[Array, "t p"]:
-        """Steady state under one period of voltages; see `Modes.respond_periodically` and `with_plays`."""
+        """Steady state in um under one period of voltages; see `Modes.respond_periodically` and `with_plays`."""
         return self.modes.respond_periodically(with_plays(voltage_V, self.threshold_V, oversampling), interval_s)
 
 

@@ -102,11 +102,11 @@ class AbstractLinear(AbstractPart):
 
     @property
     def static_gain(self) -> Float[Array, ""]:
-        """Output per input at rest."""
+        """Output per input at rest, in the unit of what the part gives over that of what it takes."""
         return self.system().gain
 
     def frequency_response(self, frequency_Hz: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Transfer function along the imaginary axis."""
+        """Transfer function along the imaginary axis, in the unit of `static_gain`."""
         return self.transfer(_imaginary(frequency_Hz))
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:

@@ -139,7 +139,7 @@ class Mechanics(AbstractLinear):
     def from_mass(
         cls, mass_kg: _Scalar, stiffness_N_per_m: _Scalar, damping_N_s_per_m: _Scalar, gain: _Scalar = 1.0
     ) -> Self:
-        """Make it from `m_w`, `k_w`, `c_w` and the static gain."""
+        """Make it from `m_w` in kg, `k_w` in N/m, `c_w` in N s/m and the static gain in um/um."""
         critical = 2 * (jnp.asarray(stiffness_N_per_m) * mass_kg) ** 0.5
         frequency = (jnp.asarray(stiffness_N_per_m) / mass_kg) ** 0.5 / (2 * jnp.pi)
         return cls(frequency, damping_N_s_per_m / critical, jnp.asarray(gain))
@@ -173,7 +173,7 @@ class Sensor(AbstractLinear):
     Attributes
     ----------
     gain
-        Reading per displacement.
+        Reading per displacement, in um/um.
     offset_um
         Reading at no displacement.
     """

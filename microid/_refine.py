@@ -28,7 +28,7 @@ def refined(time_s: Times, values: Float[Array, " t"], substeps: int, hold: Hold
     time_s
         Times of the samples, shape `(t,)`, or the one interval between them, shape `()`.
     values
-        The command, shape `(t,)`.
+        The command, shape `(t,)`, in any unit.
     substeps
         Parts of each interval.
     hold

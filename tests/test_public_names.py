@@ -180,6 +180,44 @@ def test_the_site_has_every_public_name_in_a_group_and_words_of_each(package):
         conf["words_of"](module, "nothing")
 
 
+# What says in a docstring in which unit a number is, or that it has none, or where that stands.
+TOLD = re.compile(
+    r"\b(um|V|s|Hz|N|mm|rad|urad|deg|unit|units|output_unit|%|part|share|ratio|stiffness|gains?|probability|cell|limits|"
+    r"[Mm]atrices|[Cc]oordinates|[Cc]orrelation|[Nn]umber|[Pp]art|norm)\b|[Ss]ee `|`command_V`|_(um|V|mm|rad)\b"
+)
+
+
+def results_without_unit(owner, value):
+    """Functions and properties of a class, and a function itself, that give numbers in no unit that is told."""
+    members = (
+        {owner: value}
+        if not inspect.isclass(value)
+        else {
+            f"{owner}.{name}": getattr(member, "__func__", member)
+            for name, member in vars(value).items()
+            if name[0] != "_"
+        }
+    )
+    for name, member in members.items():
+        function = member.fget if isinstance(member, property) else member
+        if not inspect.isfunction(function):
+            continue
+        given = str(inspect.signature(function).return_annotation)
+        words = inspect.getdoc(function) or ""
+        if re.search(r"\b(float|ndarray|NDArray|Array|Float)\b", given) and not (
+            UNIT.search(name) or TOLD.search(words)
+        ):
+            yield name
+
+
+@pytest.mark.parametrize("package", MODULES)
+def test_results_have_a_unit_in_their_name_or_their_docstring_tells_it(package):
+    module = importlib.import_module(package)
+    values = {name: getattr(module, name) for name in module.__all__}
+    found = [one for name, value in values.items() if is_defined(value) for one in results_without_unit(name, value)]
+    assert found == []
+
+
 def test_a_number_without_a_unit_is_seen():
     def push(force: float, voltage_V: float, travel: np.ndarray) -> float:
         """Push by a force in N."""
@@ -187,5 +225,8 @@ def test_a_number_without_a_unit_is_seen():
     assert numbers_of(push) == ["force", "voltage_V", "travel"]
     assert silent_numbers(push) == ["travel"]
     assert sum(len(numbers_of(getattr(microid.control, name))) for name in ("PID", "simulate_loop")) > 10
+    assert list(results_without_unit("push", push)) == []
+    push.__doc__ = "Push."
+    assert list(results_without_unit("push", push)) == ["push"]
     push.__doc__ = None
     assert dict(documented("push", push)) == {"push": False}

@@ -261,3 +261,14 @@ def test_long_words_are_cut_in_sentences(tmp_path):
         path = tmp_path / "stage.toml"
         path.write_text(f'schema = "{name}"\n')
         sentence(fits.read_design, path)
+
+
+def test_a_mapping_without_the_columns_is_not_told_of_separators(tmp_path):
+    """As a text is whose only column is its whole lines."""
+    with pytest.raises(
+        fits.DataError, match="mapping, column 'time_s': expected this column, found 'a'; name what is"
+    ):
+        fits.read_table({"a": [1, 2]})
+    (tmp_path / "one.csv").write_text("a\n1\n2\n")
+    with pytest.raises(fits.DataError, match="separate the columns by commas"):
+        fits.read_table(tmp_path / "one.csv")

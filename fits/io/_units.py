@@ -237,7 +237,8 @@ def _missing(
     missing: Sequence[str], names: Sequence[str], sources: Mapping[str, Source], place: str, file: str
 ) -> str:
     message = f"{place}, column '{missing[0]}': expected this column, found {_listed(names)}; "
-    if len(names) == 1:
+    # A mapping or a frame has no separators.
+    if len(names) == 1 and file:
         return f"{message}separate the columns by commas, semicolons, tabs or spaces."
     taken = {source.column for source in sources.values()}
     free = [name for name in names if name not in taken]

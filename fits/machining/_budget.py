@@ -72,7 +72,7 @@ class AxisBudget:
 
     @property
     def driving(self) -> float:
-        """The larger driving error by size, with its sign."""
+        """The larger driving error by size, with its sign, in `output_unit`."""
         return max(self.driving_highest, self.driving_lowest, key=abs)
 
     def _total(self, machining: float) -> ks.TotalError:
@@ -80,17 +80,20 @@ class AxisBudget:
 
     @property
     def signed(self) -> float:
-        """Sum with signs (Eq. 1): `driving`, all dimensions at plus one tolerance, and a reading that is too high."""
+        """Sum with signs (Eq. 1): `driving`, all dimensions at plus one tolerance, and a reading that is too high.
+
+        In `output_unit`.
+        """
         return float(self._total(self.machining_signed).signed)
 
     @property
     def worst_case(self) -> float:
-        """Sum of sizes: no signs within the tolerances are worse."""
+        """Sum of sizes, in `output_unit`: no signs within the tolerances are worse."""
         return float(self._total(self.machining_worst_case).worst_case)
 
     @property
     def root_sum_square(self) -> float:
-        """For parts, and dimensions, that are independent."""
+        """For parts, and dimensions, that are independent, in `output_unit`."""
         return float(self._total(self.machining_root_sum_square).root_sum_square)
 
     @property

@@ -50,7 +50,7 @@ class SecondOrder:
 
     @property
     def sd(self) -> float:
-        """Standard deviation at second order."""
+        """Standard deviation at second order, in the unit of the gain."""
         return float(np.sqrt(max(0.0, self.first_order_sd**2 + self.pairs.sum())))
 
     @property

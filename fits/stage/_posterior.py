@@ -96,7 +96,7 @@ class Profile:
 
     The `deviance` is twice the loss of log likelihood at the `values` where it was held, shape `(k,)` both: a
     parabola where the standard deviation says all. `lower` and `upper` are the ends of the 95 % interval, or the last
-    value looked at where the deviance stays below its bound.
+    value looked at where the deviance stays below its bound. All but the deviance, which has none, are in `unit`.
     """
 
     name: str

@@ -111,7 +111,7 @@ class SampledStage(AbstractPlant):
         self._links = tuple(links)
 
     def init(self, start: Start) -> tuple[Any, Float[Array, ""]]:
-        """State and displacement at rest; see `AbstractPlant.init`."""
+        """State and displacement in um at rest; see `AbstractPlant.init`."""
         value = jnp.zeros_like(self.interval_s) if start.rest_V is None else start.rest_V
         states = []
         for link in self._links:
@@ -120,7 +120,7 @@ class SampledStage(AbstractPlant):
         return tuple(states), value
 
     def step(self, state: Any, command_V: Float[Array, ""]) -> tuple[Any, Float[Array, ""]]:
-        """State and displacement one interval later; see `AbstractPlant.step`."""
+        """State and displacement in um one interval later; see `AbstractPlant.step`."""
 
         def once(_: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
             states, value = [], command_V

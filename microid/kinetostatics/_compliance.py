@@ -108,11 +108,11 @@ class TwoPort(eqx.Module):
 
     @property
     def ratio(self) -> Float[Array, ""]:
-        """Amplification without a load."""
+        """Amplification without a load, in um/um."""
         return self.K12_N_per_um / self.K22_N_per_um
 
     def loaded_ratio(self, load_N_per_um: Scalar) -> Float[Array, ""]:
-        """Amplification against a spring at the output."""
+        """Amplification against a spring at the output, in um/um."""
         return self.K12_N_per_um / (self.K22_N_per_um + load_N_per_um)
 
     def input_stiffness_N_per_um(self, load_N_per_um: Scalar) -> Float[Array, ""]:

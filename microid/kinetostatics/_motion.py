@@ -45,7 +45,7 @@ def f_y(
     *,
     constants: Constants,
 ) -> _Residual:
-    """Translation in y: as `f_x`, by symmetry."""
+    """Translation in y, in um of the piezo: as `f_x`, by symmetry."""
     return f_x(y_out_um, l1_mm, t1_mm, la1_mm, l2_mm, t2_mm, l3_mm, alpha1_rad, y_pzt_um, constants=constants)
 
 
@@ -90,7 +90,7 @@ def f_beta(
     *,
     constants: Constants,
 ) -> _Residual:
-    """Rotation about y: as `f_alpha`, by symmetry."""
+    """Rotation about y, in um of the piezo: as `f_alpha`, by symmetry."""
     return f_alpha(beta_out_rad, l_mm, l5_mm, la2_mm, alpha2_rad, t4_mm, beta_pzt_um, constants=constants)
 
 
