@@ -104,9 +104,11 @@ def test_the_report_prints_on_a4_and_nothing_is_cut(rng, tmp_path, kind):
     assert opened(wide, SHEET_px[0], tmp_path, LAID_OUT)["acted"]["beyond"]
 
 
-WORDS = """FAR FROM NOISE 1.745 um rms in fast.csv, 4.35 % of its stroke and 58.3 times the sensor's noise (29.9 nm)
+WORDS = """FAR FROM NOISE 1.745 um rms in fast.csv, 4.35 % of its stroke and 58.3 times the sensor's noise (29.9 nm)\
+: all below is no better
                 samples      e_rms                   e_max
 in-sample         25682    3.309 %     1.328 um    14.88 %     5.972 um
+mechanics.natural_frequency_Hz  179.9950 ± 0.0024     (95 % 179.9902..179.9998)      Hz
 e_rms: root mean square error, e_max: largest error, both in % of the measured range (Eq. 35, 36)"""
 # Ends of what holds text beyond the edge of its box, and how wide each picture is.
 WORDS_LAID = """(() => ({
@@ -129,7 +131,7 @@ def test_words_of_a_page_are_not_cut_and_pictures_have_their_size(tmp_path, widt
     acted = seen["acted"]
     assert "line" not in acted["cut"]
     assert ("row" in acted["cut"]) == (width_px < 500)
-    sentence, head, row, _ = acted["lines"]
+    sentence, head, row, *_ = acted["lines"]
     assert sentence > head == row
     narrow_px, wide_px = acted["images"]
     assert narrow_px == pytest.approx(708 * 96 / 200, abs=1)
