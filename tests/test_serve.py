@@ -24,7 +24,7 @@ from fits import default_stage, save_model
 from fits.cli.serve import _Pages
 from fits.report._diagnosis import report_html
 from fits.sweeps._run import run_sweep
-from fits.sweeps._show import summarise
+from fits.sweeps._show import open_sweep, summarise
 from fits.sweeps._store import ABOUT, LEDGER
 
 ROWS = 12
@@ -107,6 +107,11 @@ def test_a_model_and_a_sweep_open_as_pages_and_not_as_json(address, swept):
     assert re.search(rf"stroke_um +{figures['min']:.4g} ", Page(page).text)
     for words in ("<h1>Sweep whole</h1>", "kind = &#34;simulate&#34;", f" of {ROWS} rows done"):
         assert words in page
+    # Why rows failed is told once for all of them, without the value of each.
+    reasons = [str(one) for one in open_sweep(swept)["reason"].values if str(one)]
+    assert reasons
+    assert all(re.fullmatch(r"mechanics\.damping_ratio = -\S+ lies outside .*", one) for one in reasons)
+    assert f"{len(reasons)} rows: mechanics.damping_ratio lies outside its bounds, 0 to inf" in Page(page).text
     drawn = [base64.b64decode(one).decode() for one in re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page)]
     # Parallel coordinates, and one map for the only pair of parameters.
     assert len(drawn) == 2

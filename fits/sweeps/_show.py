@@ -1,6 +1,7 @@
 """What a sweep's folder holds: how far it is, figures of its outputs, and the best rows."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,7 +57,10 @@ def summarise(folder: str | os.PathLike[str], by: str | None = None, largest: bo
         if by is not None and by not in numbers:
             raise DataError(f"best: there is no output {by!r}; choose one of {', '.join(numbers)}.")
         by = by or (numbers[0] if numbers else None)
-        kinds = Counter(str(reason).partition(" = ")[0] for reason in data["reason"].values[status == FAILED])
+        # Rows that fail for one reason have another value each.
+        kinds = Counter(
+            re.sub(r" = \S+", "", str(reason), count=1) for reason in data["reason"].values[status == FAILED]
+        )
         return {
             "schema": SCHEMA,
             "kind": about["kind"],
