@@ -212,6 +212,8 @@ def test_faults_have_the_variance_that_they_make(rng):
     assert [one.statistic for one in name_faults(faults(band=wave), False)] == ["band"]
     # At an even speed a period in the position is a line in time.
     assert name_faults(faults(band=wave), True) == []
+    # A mode that rings after steps is a line in time, too.
+    assert name_faults(faults(band=wave), False, bursts=True) == []
     for other in (replace(wave, frequency_Hz=50.0), replace(wave, quality=1.0), replace(wave, z=3.0)):
         assert name_faults(faults(band=other), False) == []
 

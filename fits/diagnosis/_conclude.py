@@ -121,7 +121,9 @@ def conclude(
     faults = _standing(
         ready.faults, beside if kept else ready.faults, extension.compared, rest_um, thresholds.spike_z
     )
-    named = name_faults(faults, cyclic, thresholds)
+    unlike, in_bursts = irregular(told.first, told.plain.residual, thresholds)
+    bursts = in_bursts and not kept and not rounded
+    named = name_faults(faults, cyclic, bursts, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults, has_time)
     if kept and not has_time():
@@ -157,14 +159,13 @@ def conclude(
             "no program of this length that stays within the limits tells the class apart; allow a longer one, or "
             "wider limits where the rig has them"
         )
-    unlike, bursts = irregular(told.first, told.plain.residual, thresholds)
     # Faults of samples and noise explain nothing that is reproducible, but a narrow band may look as if it were.
     in_band = any(
         card_of(one.name).statistic == "band" and one.share_of_misfit > thresholds.explained_share for one in causes
     )
-    if bursts and not kept and not rounded:
+    if bursts:
         remarks.append("what is left comes in bursts that no effect of the library makes")
-        in_band, left_over = False, True
+        left_over = True
         excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
     unexplained_um = rest_noise * noise_um if left_over else 0.0

@@ -161,10 +161,13 @@ class Fault:
     variance_um2: float
 
 
-def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLDS) -> list[Fault]:
+def name_faults(
+    faults: Faults, cyclic: bool, bursts: bool = False, thresholds: Thresholds = THRESHOLDS
+) -> list[Fault]:
     """Which of them explain enough of what is left.
 
     What repeats itself with the position (`cyclic`) is no jitter, and at an even speed it looks like a narrow band.
+    What comes in `bursts` does, too, where a resonance rings; a floor shakes all the time.
     """
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
@@ -184,7 +187,7 @@ def name_faults(faults: Faults, cyclic: bool, thresholds: Thresholds = THRESHOLD
         jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
-    narrow = faults.is_narrow(thresholds) and not cyclic
+    narrow = faults.is_narrow(thresholds) and not cyclic and not bursts
     # Up to its own size rounding makes lines, too, where a motion is even.
     if narrow and band.size_um**2 > max(thresholds.minor_share / 3 * total, step**2 / 12):
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"

@@ -30,7 +30,7 @@ class SecondResonance(AbstractEffect):
     frequency_Hz
         `omega_2 / 2 pi`.
     damping_ratio
-        `zeta_2`.
+        `zeta_2`; from `1 / sqrt(2)` on there is no peak, and no resonance.
     """
 
     name: ClassVar[str] = "second_resonance"
@@ -50,7 +50,7 @@ class SecondResonance(AbstractEffect):
     inner: AbstractPart
     share: Float[Array, ""] = param(unit="1", scale=0.01)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=100.0, lower=1e-3)
-    damping_ratio: Float[Array, ""] = param(unit="1", scale=0.01, lower=1e-5, upper=1.0)
+    damping_ratio: Float[Array, ""] = param(unit="1", scale=0.01, lower=1e-5, upper=0.7)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -87,7 +87,7 @@ class AddedResonance(AbstractEffect):
     frequency_Hz
         `omega_2 / 2 pi`.
     damping_ratio
-        `zeta_2`.
+        `zeta_2`; from `1 / sqrt(2)` on there is no peak, and no resonance.
     """
 
     name: ClassVar[str] = "second_resonance"
@@ -105,7 +105,7 @@ class AddedResonance(AbstractEffect):
     inner: AbstractPart
     share: Float[Array, ""] = param(unit="1", scale=0.01)
     frequency_Hz: Float[Array, ""] = param(unit="Hz", scale=100.0, lower=1e-3)
-    damping_ratio: Float[Array, ""] = param(unit="1", scale=0.01, lower=1e-5, upper=1.0)
+    damping_ratio: Float[Array, ""] = param(unit="1", scale=0.01, lower=1e-5, upper=0.7)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
