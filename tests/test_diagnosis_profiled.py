@@ -21,7 +21,9 @@ from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._noise import Noise
 from microid import Driver
 from microid.effects import EFFECTS
+from microid.effects.bouc_wen_hysteresis import BoucWenHysteresis
 from microid.effects.mains_hum import MainsHum
+from microid.effects.second_resonance import SecondResonance
 
 STEP_S, COUNT = 0.01, 3300
 
@@ -234,3 +236,15 @@ def test_causes_that_add_less_than_the_models_of_others_are_off_by_do_not_count(
         for gained, first in ((0.9 * most, creep), (1.1 * most, None)):
             both = explained_by(10000.0 - gained, name, "creep")
             assert best_of_ends([both, creep], plain, THRESHOLDS) is (first or both), name
+
+
+def test_a_mode_without_a_peak_and_a_play_are_at_a_bound():
+    """Beyond a damping ratio of 1 / sqrt(2) no peak is left, and a high power switches as a play does."""
+
+    def at_bound(make, *values):
+        law = Law([make(None, *map(jnp.asarray, values))])
+        return law.at_bound(law.start)
+
+    assert [at_bound(SecondResonance, 0.01, 300.0, one) for one in (0.05, 0.5, 0.699)] == [False, False, True]
+    laws = [at_bound(BoucWenHysteresis, 0.1, 0.3, 0.8, one, 100.0) for one in (1.4, 6.0, 9.99)]
+    assert laws == [False, False, True]

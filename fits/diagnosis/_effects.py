@@ -148,13 +148,13 @@ class Law:
     def at_bound(self, x: np.ndarray) -> bool:
         """Whether a strength is at its bound, or another parameter where the effect is none of its kind any more.
 
-        That is a time constant at its lower bound, or a damping ratio at its upper one: another effect may look so.
+        Then another effect may look so. A time constant is at its lower bound, the others are at their upper ones.
         """
         values = self.values(x, 0)
         for info, at in self.entries:
             here, spec = values[at], info.spec
             below = spec.lower * (1 - _BOUND) if spec.lower < 0 else -np.inf
-            from_above = info.path in self.form.strength or info.path == "damping_ratio"
+            from_above = info.path in (*self.form.strength, *self.form.extremes)
             if from_above and np.any((here > spec.upper * (1 - _BOUND)) | (here < below)):
                 return True
             if info.path == "time_constant_s" and np.any(here < (1 + _BOUND) * spec.lower):

@@ -106,6 +106,8 @@ class AbstractEffect(AbstractPart):
         Whether there may be several of them in a record.
     counted
         Names of the fields that are whole sampling intervals.
+    extremes
+        Names of the fields at whose upper bound it is nothing of its kind any more, as a mode without a peak is none.
     lines_Hz, tolerance
         Frequencies of the lines whose amplitudes are the entries of its strengths, and the part by which those may be
         off: samples may turn a line into a drift.
@@ -162,6 +164,7 @@ class AbstractEffect(AbstractPart):
     finite: ClassVar[bool] = False
     repeats: ClassVar[bool] = False
     counted: ClassVar[tuple[str, ...]] = ()
+    extremes: ClassVar[tuple[str, ...]] = ()
     lines_Hz: ClassVar[tuple[float, ...]] = ()
     tolerance: ClassVar[float] = 0.0
     phases: ClassVar[tuple[str, ...]] = ()

@@ -59,6 +59,8 @@ class BoucWenHysteresis(AbstractEffect):
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("amplitude_um",)
     history: ClassVar[tuple[str, ...]] = ("before",)
+    # There it is a play, which every density has.
+    extremes: ClassVar[tuple[str, ...]] = ("exponent",)
     fingerprint: ClassVar[str] = (
         "Minor loops between the same voltages differ in height and do not close, at any rate: a reversal is "
         "forgotten by and by as the voltage goes on, and not at once when it is passed."

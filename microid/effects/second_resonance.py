@@ -39,6 +39,7 @@ class SecondResonance(AbstractEffect):
     place: ClassVar[Place] = "mechanics"
     strength: ClassVar[tuple[str, ...]] = ("share",)
     fast: ClassVar[bool] = True
+    extremes: ClassVar[tuple[str, ...]] = ("damping_ratio",)
     fingerprint: ClassVar[str] = (
         "Ringing at a second frequency after steps, and a narrow peak or notch in the frequency response; nothing in "
         "slow records."
@@ -97,6 +98,7 @@ class AddedResonance(AbstractEffect):
     place: ClassVar[Place] = "mechanics"
     strength: ClassVar[tuple[str, ...]] = ("share",)
     fast: ClassVar[bool] = True
+    extremes: ClassVar[tuple[str, ...]] = ("damping_ratio",)
     fingerprint: ClassVar[str] = SecondResonance.fingerprint
     confusions: ClassVar[tuple[str, ...]] = SecondResonance.confusions
     experiment: ClassVar[str] = SecondResonance.experiment
