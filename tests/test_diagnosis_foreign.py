@@ -116,6 +116,21 @@ def test_a_stack_in_steps_beside_lines_has_no_effect(rng):
 
 
 @pytest.mark.study
+def test_a_slow_run_in_lines_beside_one_in_steps_has_no_effect(rng):
+    """Beside a stage fitted in one way to both, the readings of the other look late by half a sample."""
+    levels_V = np.r_[0, 100, 0, 80, 20, 100, 40, 70, 30, 90, 0, 60, 10, 100, 0]
+    slow = rig(rng, lambda t: np.interp(t, 0.3 * np.arange(len(levels_V)), levels_V), 4.2, 0.01)
+    held = np.r_[0.0, np.repeat(rng.uniform(0, 100, 300), 8)]
+    fine_s, natural = np.arange(len(held) * FINE) / (RATE_Hz * FINE), 2 * np.pi * 180
+    driven = lsim(([1.0], [5e-4, 1.0]), np.repeat(held, FINE), fine_s, interp=False)[1]
+    moved = lsim(([natural**2], [1.0, 0.1 * natural, natural**2]), plays(driven), fine_s)[1][::FINE]
+    noisy = moved + 0.01 * rng.standard_normal(len(held))
+    found = diagnose([slow, Record(np.arange(len(held)) / RATE_Hz, held, noisy, source="steps.csv")])
+    assert found.verdict == "no_effect"
+    assert [run.hold for run in found.details["ready"].baseline.runs] == ["first", "zero"]
+
+
+@pytest.mark.study
 def test_creep_that_was_under_way(rng):
     """The record begins after moves whose creep goes on: the gain is found all the same."""
     before = turns([50, 100, 30, 0], 600)

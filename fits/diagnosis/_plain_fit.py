@@ -174,11 +174,12 @@ class PlainFit:
         most = max(thresholds.other_hold_z**2, (1 - thresholds.model_error) * self.largest_z() ** 2)
         return "zero" not in self.holds and far and self.delay_drop(self.left) > most
 
-    def leaves_less(self, other: "PlainFit") -> bool:
-        """Whether less is left here than another fit leaves beside the best effect."""
+    def leaves_less(self, other: "PlainFit", beside: bool = True) -> bool:
+        """Whether less is left here than another fit leaves, `beside` the best effect or without any."""
         here = Projector(self.regression, other.faults.noise).bounded()
         left = here.off(here.residual)
-        return float(left @ left) < float(other.left @ other.left) - other.largest_z() ** 2
+        explained = other.largest_z() ** 2 if beside else 0.0
+        return float(left @ left) < float(other.left @ other.left) - explained
 
     def left_beside_lag(self) -> float:
         """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""

@@ -137,6 +137,11 @@ def prepare_diagnosis(
                     other = plain if plain.outdoes(other) else other
                 # What comes late at a sensor looks like a command that does so between samples.
                 here = here if here.outdoes(other) else other
+            if here is other and has_time() and (own := here.better_holds(reading.thresholds)) != here.holds:
+                # What this stage leaves is less, and shows of each run how it goes.
+                progress("fitting the plain stage again, the command of each run in its own way between samples")
+                other = fitted(own, here.regression.baseline.problem)
+                here = other if other.leaves_less(here, False) else here
             drop_programs(records)
         said = (*said, *_of_holds(here.regression.baseline))
     if here.regression.baseline.dynamic:
