@@ -57,6 +57,13 @@ def test_curves_are_seen_beside_an_effect_that_hides_them():
     assert prefers("smooth", lines=177000, other=177092, late=8.0, best=166765, best_after=167132)
 
 
+def test_steps_are_seen_beside_an_effect_that_hides_them():
+    """As a clock that is off by 127 ppm did, beside a stage that had taken up how late the readings were."""
+    assert prefers("zero", lines=50518, other=73151, late=2291, best=16449, best_after=61377)
+    assert not prefers("zero", lines=50518, other=73151, late=2291, best=16449, best_after=39000)
+    assert not prefers("zero", lines=50518, other=67182, late=0.0, best=39000, best_after=55740)
+
+
 def test_curves_that_leave_a_little_less_of_much_are_no_way_of_the_command():
     assert not prefers("smooth", lines=74000, other=75700, late=0.0, best=50700, best_after=52650)
 

@@ -138,30 +138,37 @@ class PlainFit:
                 found = _climbed(worth, without, _HOLDS[:2])
         best = self.largest_z() ** 2
 
+        @cache
         def beside(holds: Holds) -> float:
             return gained(holds) + self.largest_z(self.left_under(holds)) ** 2
 
-        def shared(holds: Holds) -> Holds:
+        def shared(holds: Holds, by: Callable[[Holds], float] = gained) -> Holds:
             """The same with runs that do not show their own way going as the others do.
 
             Of what more than noise is left in any way, a small part shows none.
             """
-            alike = max(((way,) * len(holds) for way in dict.fromkeys(holds)), key=gained)
+            alike = max(((way,) * len(holds) for way in dict.fromkeys(holds)), key=by)
             own = max(least, off * (whole - len(self.left)))
-            return alike if gained(alike) > gained(holds) - own else holds
+            return alike if by(alike) > by(holds) - own else holds
 
         if "zero" in found and found != taken:
             return shared(found) if gained(found) > least and beside(found) > (1 - off) * best else taken
         # A large effect may hide between the samples what only shows beside it.
         each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
-        curves = [tuple(_HOLDS[1] if k in which else hold for k, hold in enumerate(taken)) for which in each]
-        others = [holds for holds in (found, *curves) if holds != taken]
-        found = max(others, key=beside)
+
+        def hidden(way: Hold) -> list[Holds]:
+            found = (tuple(way if k in which else hold for k, hold in enumerate(taken)) for which in each)
+            return [holds for holds in found if holds != taken]
+
+        curves = [*dict.fromkeys((*(one for one in (found,) if one != taken), *hidden(_HOLDS[1])))]
+        # Steps that leave less without any effect were judged by what a delay does.
+        steps = [holds for holds in hidden(_HOLDS[2]) if gained(holds) < least]
+        found = max((*curves, *steps), key=beside)
         # Of what more than noise is left in any way, a small part decides nothing.
         if beside(found) > best + max(least, off * (whole - best - len(self.left))):
-            return shared(found)
+            return shared(found, beside)
         # They need no parameter, and are taken beside an effect that would explain little more.
-        found = max(others, key=gained)
+        found = max(curves, key=gained, default=taken)
         large = gained(found) > max(least, thresholds.minor_share * best)
         return shared(found) if large and beside(found) > (1 - off) * best else taken
 
