@@ -61,6 +61,9 @@ def test_steps_are_seen_beside_an_effect_that_hides_them():
     """As a clock that is off by 127 ppm did, beside a stage that had taken up how late the readings were."""
     assert prefers("zero", lines=50518, other=73151, late=2291, best=16449, best_after=61377)
     assert not prefers("zero", lines=50518, other=73151, late=2291, best=16449, best_after=39000)
+    # Beside what else is there, they leave less than a delay does.
+    assert prefers("zero", lines=16457, other=15613, late=893, best=907, best_after=448)
+    assert not prefers("zero", lines=16457, other=16057, late=893, best=907, best_after=848)
     assert not prefers("zero", lines=50518, other=67182, late=0.0, best=39000, best_after=55740)
 
 

@@ -28,6 +28,8 @@ IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
 # What is left exceeds noise by no more than this part of it.
 _NOISE = 0.05
+# A lag beside lines that is no more than steps leaves less of what is beyond noise by no more than this part.
+_PLAIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -161,8 +163,10 @@ class PlainFit:
             return [holds for holds in found if holds != taken]
 
         curves = [*dict.fromkeys((*(one for one in (found,) if one != taken), *hidden(_HOLDS[1])))]
-        # Steps that leave less without any effect were judged by what a delay does.
-        steps = [holds for holds in hidden(_HOLDS[2]) if gained(holds) < least]
+        # Steps that leave less without any effect explain what a delay does.
+        late = delayed(taken)
+        some = (1 - off) * late if late > least else np.inf
+        steps = [holds for holds in hidden(_HOLDS[2]) if not least <= gained(holds) <= some]
         found = max((*curves, *steps), key=beside)
         # Of what more than noise is left in any way, a small part decides nothing.
         if beside(found) > best + max(least, off * (whole - best - len(self.left))):
@@ -221,7 +225,8 @@ class PlainFit:
         if rest <= (1 + _NOISE) * len(left):
             return False
         if "zero" in other.holds:
-            return self.left_beside_lag() < rest
+            # They need no parameter.
+            return self.left_beside_lag() < rest - _PLAIN * (rest - len(left))
         # Of what is more than noise either way, a small part decides nothing.
         here = float(self.left @ self.left)
         if here - whole < _NOISE * (here - len(left)):
