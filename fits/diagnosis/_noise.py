@@ -89,7 +89,8 @@ def find_faults(
         left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
         bad = spikes(run.record.voltage_V, left, 2 * quantum, thresholds.spike_z)
         # A stage that would have to move far leaves spikes of its own, to first order, where the readings have none.
-        bad &= (residual - _between(residual, bad)) / np.where(bad, left - _between(left, bad), 1.0) > _SEEN
+        alone = left - _between(left, bad)
+        bad &= (residual - _between(residual, bad)) * alone > _SEEN * alone**2
         smooth = _between(left, bad)
         found.append(bad)
         heights.append(left - smooth)
