@@ -17,7 +17,6 @@ from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
 from fits.diagnosis._thresholds import THRESHOLDS
-from fits.io._kept import kept
 from fits.loop._run import Run
 from fits.stage._motion import at_samples, signals
 from fits.stage._run import nuisance_columns, project_out
@@ -141,7 +140,8 @@ def _compare(
         behind = Bench(bench.baseline, aside=True, finest=finest)
         for k, run in enumerate(ready.baseline.fine_aside):
             plain = simulate(ready.baseline.stage, run)
-            nuisance, using = np.asarray(_nuisance(ready.baseline.stage, run.samples))[: len(run.record)], run.known
+            columns = nuisance_columns(ready.baseline.stage, run.samples)
+            nuisance, using = np.asarray(columns)[: len(run.record)], run.known
             better_um = _with_past(behind, k, effects, run, simulate(bench.baseline.stage, run), nuisance)
             found.append(Compared(run, left_of(run, nuisance, plain, using), better_um, using))
     return tuple(found)
@@ -184,7 +184,6 @@ def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.n
 
 
 _without = eqx.filter_jit(project_out)
-_nuisance = kept(nuisance_columns)
 
 
 def predicts_worse(compared: Sequence[Compared], worse_z: float, most: float) -> bool:

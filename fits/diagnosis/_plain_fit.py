@@ -158,15 +158,16 @@ class PlainFit:
         # A large effect may hide between the samples what only shows beside it.
         each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
 
-        def hidden(way: Hold) -> list[Holds]:
-            found = (tuple(way if k in which else hold for k, hold in enumerate(taken)) for which in each)
-            return [holds for holds in found if holds != taken]
+        def instead(way: Hold) -> list[Holds]:
+            """One run, or all of them, going in another way."""
+            changed = (tuple(way if k in which else hold for k, hold in enumerate(taken)) for which in each)
+            return [holds for holds in changed if holds != taken]
 
-        curves = [*dict.fromkeys((*(one for one in (found,) if one != taken), *hidden(_HOLDS[1])))]
+        curves = [holds for holds in (found, *instead(_HOLDS[1])) if holds != taken]
         # Steps that leave less without any effect explain what a delay does.
         late = delayed(taken)
-        some = (1 - off) * late if late > least else np.inf
-        steps = [holds for holds in hidden(_HOLDS[2]) if not least <= gained(holds) <= some]
+        as_delay = (1 - off) * late if late > least else np.inf
+        steps = [holds for holds in instead(_HOLDS[2]) if not least <= gained(holds) <= as_delay]
         found = max((*curves, *steps), key=beside)
         # Of what more than noise is left in any way, a small part decides nothing.
         if beside(found) > best + max(least, off * (whole - best - len(self.left))):
