@@ -59,9 +59,9 @@ def loops_of(runs: Sequence[Drawn]) -> Figure:
     picture, axes = _columns(runs, style.NARROW_in if len(runs) == 1 else style.WIDE_in)
     for each, (loop, error) in zip(runs, axes.T, strict=False):
         voltage, known = each.run.record.voltage_V, each.run.known
-        # Loops run over each other many times: as lines, or on dark ones, both would hide each other.
-        style.curve(loop, voltage, each.predicted_um, "model", **style.MODEL | {"color": style.LIGHT})
-        style.dots(loop, voltage, each.run.displacement_um, "measured")
+        # Loops run over each other many times: thick lines of the model would hide what was measured.
+        style.curve(loop, voltage, each.predicted_um, "model", **style.MODEL | {"linewidth": 0.3})
+        style.dots(loop, voltage, each.run.displacement_um, "measured", style.MEASURED["color"], 1.8)
         error.axhline(0.0, color=style.LIGHT, linewidth=0.6)
         style.dots(error, voltage[known], each.off_um[known])
         style.label(error, "voltage (V)")

@@ -90,10 +90,10 @@ def curve(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", **style: Any
     axes.plot(x[keep], y[keep], label=name, **style)
 
 
-def dots(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", color: str = DARK) -> None:
-    """Draw samples, shape `(n,)`, as dots; of many some, evenly chosen."""
+def dots(axes: Axes, x: np.ndarray, y: np.ndarray, name: str = "", color: str = DARK, size: float = 1.2) -> None:
+    """Draw samples, shape `(n,)`, as dots of a size in points; of many some, evenly chosen."""
     every = -(-len(x) // _POINTS) or 1
-    how: dict[str, Any] = {"color": color, "markersize": 1.2, "markeredgewidth": 0, "rasterized": True}
+    how: dict[str, Any] = {"color": color, "markersize": size, "markeredgewidth": 0, "rasterized": True}
     axes.plot(x[::every], y[::every], ".", label=name, **how)
 
 
