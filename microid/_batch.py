@@ -108,4 +108,4 @@ def _hysteresis(law: Preisach, signal: Signal, memory: Staircase | None) -> Sign
     total = lax.map(lambda row: forest_sum(*row), (step, remembered.anchor))
     branch = jax.vmap(Everett._branch, (axis, 0, 0))(surface, place, remembered.rising)
     output = (law.offset_um[:, None] + total + branch)[:, remembered.lead :]
-    return Signal(output[:, 1:], output[:, 0], signal.hold)
+    return signal.with_values(output[:, 1:], output[:, 0])

@@ -11,7 +11,7 @@ from microid._linear import Times
 from microid._part import AbstractHysteresis, AbstractPart, AbstractStepper, Signal
 from microid._plant import Mechanics
 from microid.control._hysteresis_step import _step_form
-from microid.effects._oscillator import _forces_um
+from microid.effects._oscillator import _braked, _forces_um
 
 # Newton's steps to the displacement at rest, on a curve that rises everywhere.
 _STEPS = 8
@@ -71,4 +71,4 @@ class HystereticMechanics(AbstractPart):
 
         before = -yields / gain
         taken = _forces_um(self.inner, time_s, signal, force, before, memory)
-        return self.inner.run(time_s, Signal(signal.values - taken, signal.before - before, signal.hold), start)
+        return _braked(self.inner, time_s, signal, start, taken, before)

@@ -28,6 +28,7 @@ class _NumpySignal(NamedTuple):
     values: np.ndarray
     before: np.ndarray
     hold: str
+    settling_s: complex | None = None
 
 
 def _instants(interval_s: np.ndarray, count: int) -> np.ndarray:

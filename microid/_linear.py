@@ -17,6 +17,7 @@ from microid._precision import _full_precision
 Hold = Literal["first", "zero", "smooth"]
 """How an input goes between samples: in a line, in a step that holds the last one, or in a smooth curve."""
 Times = Float[Array, " t"] | Float[Array, ""]
+_Between = tuple[Hold, Float[Array, ""] | None]
 # With a norm of at most a half, sixteen terms of the exponential series leave less than rounding.
 _TERMS = 16
 # Each doubles the interval: enough for rates of 1e19 per sample.
@@ -83,6 +84,7 @@ class LinearSystem(eqx.Module):
         before: Float[Array, ""],
         hold: Hold = "first",
         by_samples: bool = False,
+        settling_s: Float[Array, ""] | None = None,
     ) -> Float[Array, " t"]:
         """Respond to a sampled input, exactly for the given hold.
 
@@ -102,6 +104,9 @@ class LinearSystem(eqx.Module):
         by_samples
             Go from sample to sample, with one interval between all: on a CPU the fastest way for many systems that
             are mapped over together (`jax.vmap`).
+        settling_s
+            Under the hold `"first"`, a time constant with which the input settles from each sample to the next, in
+            place of a line, shape `()`.
 
         Returns
         -------
@@ -136,15 +141,15 @@ class LinearSystem(eqx.Module):
         time = lax.stop_gradient(jnp.asarray(time_s))
         if time.ndim == 0:
             even = self._by_samples if by_samples else self._on_even_times
-            moved = even(time.astype(signal.dtype), start, change, hold)
+            moved = even(time.astype(signal.dtype), start, change, (hold, settling_s))
         else:
             interval = jnp.diff(time)
             mean = (time[-1] - time[0]) / interval.shape[0]
             rounding = 4 * jnp.finfo(time.dtype).eps * jnp.maximum(jnp.abs(time[0]), jnp.abs(time[-1]))
             moved = lax.cond(
                 jnp.max(jnp.abs(interval - mean)) <= rounding,
-                lambda self, *rest: self._on_even_times(mean.astype(signal.dtype), *rest, hold),
-                lambda self, *rest: self._on_any_times(interval.astype(signal.dtype), *rest, hold),
+                lambda self, *rest: self._on_even_times(mean.astype(signal.dtype), *rest, (hold, settling_s)),
+                lambda self, *rest: self._on_any_times(interval.astype(signal.dtype), *rest, (hold, settling_s)),
                 self,
                 start,
                 change,
@@ -152,9 +157,11 @@ class LinearSystem(eqx.Module):
         return jnp.concatenate([first[None], level[1:] + moved])
 
     def advance(
-        self, interval_s: Float[Array, " k"], hold: Hold
+        self, interval_s: Float[Array, " k"], hold: Hold, settling_s: Float[Array, ""] | None = None
     ) -> tuple[Float[Array, "n n k"], Float[Array, "n k"]]:
         """Matrices `exp(A h)`, and what the states lose by an input that rises by one."""
+        if settling_s is not None:
+            return self._advance_settling(interval_s, settling_s)
         n, longest = self.order, jnp.max(interval_s)
         whole = self.rate_per_s * longest
         norm = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(whole), axis=1)))
@@ -189,23 +196,38 @@ class LinearSystem(eqx.Module):
         )
         return one + less, mean if hold == "first" else jnp.broadcast_to(self.rest[:, None], mean.shape)
 
+    def _advance_settling(
+        self, interval_s: Float[Array, " k"], settling_s: Float[Array, ""]
+    ) -> tuple[Float[Array, "n n k"], Float[Array, "n k"]]:
+        """As `advance`, of an input whose rate decays as `exp(-t / settling_s)` within each interval.
+
+        That rate is one more state, which drives the others: exact even where it decays as they do.
+        """
+        n, rate = self.order, 1 / settling_s
+        driven = jnp.concatenate([self.rate_per_s, -rate * self.rest[:, None]], axis=1)
+        decays = jnp.concatenate([jnp.zeros_like(self.rest), -rate[None]])
+        nothing = jnp.zeros(n + 1, dtype=self.rest.dtype)
+        larger = LinearSystem(jnp.concatenate([driven, decays[None]]), nothing, nothing, self.gain, self.offset)
+        step, _ = larger.advance(interval_s, "zero")
+        return step[:n, :n], step[:n, n] / jnp.expm1(-rate * interval_s)[None]
+
     def _on_any_times(
-        self, interval_s: Float[Array, " k"], start: Float[Array, " n"], change: Float[Array, " k"], hold: Hold
+        self, interval_s: Float[Array, " k"], start: Float[Array, " n"], change: Float[Array, " k"], between: _Between
     ) -> Float[Array, " k"]:
         # In pieces, each made again when it is differentiated: all doublings of all samples would not fit.
         pieces = -(-interval_s.shape[0] // _PIECE)
         filled = jnp.pad(interval_s, (0, pieces * _PIECE - interval_s.shape[0]), mode="edge").reshape(pieces, _PIECE)
-        advance = jax.checkpoint(lambda system, piece: system.advance(piece, hold))
+        advance = jax.checkpoint(lambda system, piece: system.advance(piece, *between))
         every = lax.map(lambda piece: advance(self, piece), filled)
         step, taken = (jnp.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[: interval_s.shape[0]] for x in every)
         push = -taken * change[:, None]
         return recur(step, push.at[0].add(step[0] @ start)) @ self.read
 
     def _on_even_times(
-        self, interval_s: Float[Array, ""], start: Float[Array, " n"], change: Float[Array, " k"], hold: Hold
+        self, interval_s: Float[Array, ""], start: Float[Array, " n"], change: Float[Array, " k"], between: _Between
     ) -> Float[Array, " k"]:
         """Answer of each block of samples to itself as one product, then of the blocks to those before them."""
-        step, taken = (x[..., 0] for x in self.advance(interval_s[None], hold))
+        step, taken = (x[..., 0] for x in self.advance(interval_s[None], *between))
         blocks = -(-change.shape[0] // _BLOCK)
         inside = jnp.pad(change, (0, blocks * _BLOCK - change.shape[0])).reshape(blocks, _BLOCK)
         # Column j: the states j samples after a change of one, and what states add to the output j + 1 samples on.
@@ -219,10 +241,10 @@ class LinearSystem(eqx.Module):
         return (inside @ answer + state @ later).ravel()[: change.shape[0]]
 
     def _by_samples(
-        self, interval_s: Float[Array, ""], start: Float[Array, " n"], change: Float[Array, " k"], hold: Hold
+        self, interval_s: Float[Array, ""], start: Float[Array, " n"], change: Float[Array, " k"], between: _Between
     ) -> Float[Array, " k"]:
         """The same in one pass, whose states are scalars: mapped over many systems they are vectors."""
-        step, taken = (x[..., 0] for x in self.advance(interval_s[None], hold))
+        step, taken = (x[..., 0] for x in self.advance(interval_s[None], *between))
 
         def visit(z: tuple[Array, ...], change: Array) -> tuple[tuple[Array, ...], Array]:
             z = tuple(

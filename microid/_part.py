@@ -25,11 +25,19 @@ class Signal(eqx.Module):
     hold
         How the signal runs between samples: in lines, `"first"`, in steps, `"zero"`, or `"smooth"`, as what comes out
         of an inertia does.
+    settling_s
+        Where a signal in lines settles from each sample to the next instead, as behind a driver whose command is
+        held: with this time constant, shape `()`.
     """
 
     values: Float[Array, " t"]
     before: Float[Array, ""]
     hold: Hold = eqx.field(static=True)
+    settling_s: Float[Array, ""] | None = None
+
+    def with_values(self, values: Float[Array, " t"], before: Float[Array, ""]) -> "Signal":
+        """Another signal that runs between its samples as this one does."""
+        return Signal(values, before, self.hold, self.settling_s)
 
 
 class Scene(eqx.Module):
@@ -128,7 +136,7 @@ class AbstractHysteresis(AbstractPart):
         """Pass a voltage on, which has come from the scene's memory to its value before the first sample."""
         memory = start.memory if isinstance(start, Scene) else start
         displacement_um = self(jnp.concatenate([signal.before[None], signal.values]), memory)
-        return Signal(displacement_um[1:], displacement_um[0], signal.hold)
+        return signal.with_values(displacement_um[1:], displacement_um[0])
 
 
 class AbstractStepper(eqx.Module):
@@ -150,10 +158,12 @@ def _joined(parts: Iterable[AbstractLinear]) -> LinearSystem:
 
 def _run_linear(system: LinearSystem, time_s: Times, signal: Signal, by_samples: bool = False) -> Signal:
     """Pass a signal through a linear system that was at rest; see `LinearSystem.respond`."""
-    values = system.respond(time_s, signal.values, signal.before, signal.hold, by_samples)
+    values = system.respond(time_s, signal.values, signal.before, signal.hold, by_samples, signal.settling_s)
     before = system.offset + system.gain * signal.before
     if system.order == 0:
-        return Signal(values, before, signal.hold)
+        return signal.with_values(values, before)
+    if system.order == 1 and signal.hold == "zero":
+        return Signal(values, before, "first", -1 / system.rate_per_s[0, 0])
     # Behind a step even what comes out of an inertia may have a corner.
     return Signal(values, before, "first" if signal.hold == "zero" else "smooth")
 

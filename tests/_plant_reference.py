@@ -52,6 +52,21 @@ def states(a, b, time_s, signal, hold, before=None, interval=van_loan):
     return np.array(out)
 
 
+def settling(a, b, time_s, signal, time_constant_s, before):
+    """States at all samples of a signal that settles from each to the next: a lag of the first order that is held."""
+    n, rate = len(a), 1 / time_constant_s
+    x, out = np.linalg.solve(a, -b) * before, []
+    for k, value in enumerate(signal):
+        out.append(x)
+        if k + 1 == len(signal):
+            return np.array(out)
+        h = time_s[k + 1] - time_s[k]
+        aim = value + (signal[k + 1] - value) / -np.expm1(-h * rate)
+        big = np.zeros((n + 2, n + 2))
+        big[:n, :n], big[:n, n], big[n, n:] = a, b, [-rate, rate]
+        x = (expm(big * h) @ np.concatenate([x, [value, aim]]))[:n]
+
+
 def smoothed(time_s, signal):
     """Samples whose joining lines have, on average, the height of the parabolas through three samples each."""
     out = np.array(signal, dtype=float)

@@ -33,7 +33,7 @@ _FINEST = 32
 _COARSE = 4
 # Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
 # all samples together, in noise.
-_FINE, _FINE_STEPS, _LARGEST_DIFFERENCE = 16, 64, 1.0
+_FINE, _LARGEST_DIFFERENCE = 16, 1.0
 
 
 class Fixed(eqx.Module):
@@ -169,12 +169,12 @@ def fit_baseline(
 
     asked = _prepared(aside, range_V, initial, 0.0, _FINE, False)
     held_holds = [_hold_of(solved.stage, run, better) for run in asked]
-    # What a step starts is over soon, and slow runs sample it sparsely.
-    many = _FINE_STEPS if "zero" in (*holds, *held_holds) else _FINE
-    (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, many))
+    (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, _FINE))
+    # Behind a step a reading has corners that whole steps do not show to what reads it between samples.
+    few = _COARSE if "zero" in (*holds, *held_holds) else min(stride, _COARSE)
     return Baseline(
         *(chain, solved.z, solved.columns_um, prior, stroke_um, range_V, runs, held),
-        *prepared(min(stride, _COARSE)),
+        *prepared(few),
         *(finest, finest_held),
         tuple(map(partial(_with_enough_steps, solved.stage), runs, finest)),
         tuple(map(partial(_with_enough_steps, solved.stage), held, finest_held)),

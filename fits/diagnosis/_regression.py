@@ -194,9 +194,9 @@ def _rough_pasts(baseline: Baseline) -> tuple[np.ndarray, ...]:
     assert place is not None
     levels_V, own = np.linspace(float(grid.lower_V), float(grid.upper_V), _PAST), []
     for run in baseline.runs:
-        seen_V = np.asarray(ahead(stage, place, run.samples))
-        columns = rough_past_columns(seen_V, levels_V) * baseline.stroke_um / np.ptp(levels_V)
-        columns = np.asarray(answered(stage, place, run.samples, jnp.asarray(columns)))[: len(run.record)]
+        seen = ahead(stage, place, run.samples)
+        columns = rough_past_columns(np.asarray(seen.values), levels_V) * baseline.stroke_um / np.ptp(levels_V)
+        columns = np.asarray(answered(stage, place, run.samples, jnp.asarray(columns), seen))[: len(run.record)]
         own.append(columns if run.has_past else columns[:, :0])
     stops = np.cumsum([columns.shape[1] for columns in own])
     return tuple(

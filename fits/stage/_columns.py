@@ -14,7 +14,7 @@ from fits.loop._run import Run, Samples
 from fits.loop._stepped import intervals
 from fits.stage._chain import Chain
 from fits.stage._plain_linear import Linear
-from fits.stage._run import ahead, joined
+from fits.stage._run import ahead, joined, lines_of
 from microid import Coordinates, LinearSystem, Scene, Signal, Stage, Staircase
 
 # Samples that are passed on at a time.
@@ -71,8 +71,10 @@ def _propagated(
     beside = {name: values[each] for name, values in samples.beside.items()}
     scene = Scene(command, beside, samples.start.memory)
 
+    between = lines_of(ahead(stage, place, samples))
+
     def follow(values: Float[Array, " n"]) -> Float[Array, " n"]:
-        signal = Signal(values, values[0], "first")
+        signal = Signal(values, values[0], *between)
         for part in stage.parts[place + 1 :]:
             signal = part.run(time_s, signal, scene)
         return signal.values
@@ -84,10 +86,12 @@ def _propagated(
 @kept
 def _before_and_after(
     coordinates: Coordinates[Stage], place: int, z: Float[Array, " p"], samples: Samples
-) -> tuple[Float[Array, " n"], LinearSystem | None]:
-    """Voltage that the hysteresis sees, at the samples, and the linear system that follows it."""
+) -> tuple[Signal, LinearSystem | None]:
+    """What the hysteresis sees, at the samples, and the linear system that follows it."""
     stage = coordinates(z)
-    return ahead(stage, place, samples)[:: samples.stride], joined(stage.parts[place + 1 :])
+    seen = ahead(stage, place, samples)
+    at_samples = seen.with_values(seen.values[:: samples.stride], seen.before)
+    return at_samples, joined(stage.parts[place + 1 :])
 
 
 @kept
@@ -102,12 +106,15 @@ def _passed(
 ) -> Iterator[np.ndarray]:
     """What follows the hysteresis makes of responses to the voltage that it sees, piece by piece."""
     assert chain.place is not None
-    voltage_V, system = _before_and_after(chain.coordinates, chain.place, z, run.samples)
-    responses = respond(np.asarray(voltage_V)[: len(run.record)])
+    seen, system = _before_and_after(chain.coordinates, chain.place, z, run.samples)
+    responses = respond(np.asarray(seen.values)[: len(run.record)])
     if system is None:
         return responses
     rate, rest, read = map(np.asarray, (system.rate_per_s, system.rest, system.read))
-    return Linear(rate, rest, read, float(system.gain), 0.0).follow(intervals(run.record.time_s), responses)
+    behind = Linear(rate, rest, read, float(system.gain), 0.0)
+    hold, settling_s = lines_of(seen)
+    settles = None if settling_s is None else float(settling_s)
+    return behind.follow(intervals(run.record.time_s), responses, hold, settles)
 
 
 def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterator[tuple[int, np.ndarray]]:

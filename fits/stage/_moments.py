@@ -92,7 +92,8 @@ def along(
     moved_um: Iterable[np.ndarray] = combined(chain, z, run, directions[0])
     if chain.place is not None and not passes_linearly(stage := chain.stage(z, columns_um), chain.place):
         # What is not linear needs all of a record at a time.
-        around_um = np.asarray(ahead(stage, chain.place + 1, run.samples))[:: run.samples.stride][: len(run.record)]
+        given_um = np.asarray(ahead(stage, chain.place + 1, run.samples).values)
+        around_um = given_um[:: run.samples.stride][: len(run.record)]
         whole_um = np.concatenate([*moved_um])
         whole_um = propagated(chain.coordinates, chain.place, z, run, around_um, whole_um)
         moved_um = (whole_um[first : first + PIECE] for first in range(0, len(whole_um), PIECE))

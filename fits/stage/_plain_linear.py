@@ -54,7 +54,14 @@ class Linear:
             other.gain * self.offset + other.offset,
         )
 
-    def respond(self, interval_s: np.ndarray, signal: np.ndarray, before: np.ndarray, hold: str) -> np.ndarray:
+    def respond(
+        self,
+        interval_s: np.ndarray,
+        signal: np.ndarray,
+        before: np.ndarray,
+        hold: str,
+        settling_s: complex | None = None,
+    ) -> np.ndarray:
         """Respond to samples of signals, `(t, k)`, which rested at `before`, `(k,)`; see `microid.LinearSystem`.
 
         Intervals are `(t - 1,)`, or `(1,)` where all are alike; the `hold` is `first`, `zero` or `smooth`.
@@ -67,11 +74,16 @@ class Linear:
             directly = self.gain - self.read @ self.rest
             return self.respond(interval_s, bent, before, "first") + directly * (signal - bent)
         start = self.rest[:, None] * (before - signal[0])
-        moved, _ = self.move(interval_s, np.diff(signal, axis=0), start, hold)
+        moved, _ = self.move(interval_s, np.diff(signal, axis=0), start, hold, settling_s)
         return level + np.concatenate([(self.read @ start)[None], moved])
 
     def move(
-        self, interval_s: np.ndarray, change: np.ndarray, start: np.ndarray, hold: str
+        self,
+        interval_s: np.ndarray,
+        change: np.ndarray,
+        start: np.ndarray,
+        hold: str,
+        settling_s: complex | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """What the states add to the output after each change of signals, `(t, k)`, and the states in the end.
 
@@ -79,15 +91,23 @@ class Linear:
         """
         if len(self.rest) == 0:
             return np.zeros_like(change), start
-        step, taken = self._advance(interval_s, hold)
+        step, taken = self._advance(interval_s, hold, settling_s)
         if change.shape[1] >= _BLOCK:
             return self._products(step, taken, change, start)
         push = -taken[:, :, None] * change[:, None]
         states = _blockwise(step, push, start)
         return self.read @ states, states[-1] if len(states) else start
 
-    def follow(self, interval_s: np.ndarray, pieces: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-        """Respond to many signals piece by piece, `(l, k)` each, which rested before and run in lines; no offset.
+    def follow(
+        self,
+        interval_s: np.ndarray,
+        pieces: Iterable[np.ndarray],
+        hold: str = "first",
+        settling_s: complex | None = None,
+    ) -> Iterator[np.ndarray]:
+        """Respond to many signals piece by piece, `(l, k)` each, which rested before; no offset.
+
+        They run in lines, settle with a time constant from each sample to the next, or are held.
 
         Intervals are those between samples, `(t - 1,)`, or `(1,)` where all are alike.
         """
@@ -98,7 +118,7 @@ class Linear:
         for signals in pieces:
             change = np.diff(signals, axis=0, prepend=signals[:1] if last is None else last)
             each = interval_s if len(interval_s) == 1 else interval_s[first : first + len(signals)]
-            moved, states = self.move(each, change, states, "first")
+            moved, states = self.move(each, change, states, hold, settling_s)
             moved += self.gain * signals
             yield moved
             last, first = signals[-1:].copy(), first + len(signals)
@@ -143,8 +163,16 @@ class Linear:
             answer[:, j] = self.read @ state
         return answer, state
 
-    def _advance(self, interval_s: np.ndarray, hold: str) -> tuple[np.ndarray, np.ndarray]:
+    def _advance(
+        self, interval_s: np.ndarray, hold: str, settling_s: complex | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Matrices `exp(A h)`, and what the states lose by an input that rises by one, `(t, n, n)` and `(t, n)`."""
+        if settling_s is not None:
+            n, rate = len(self.rest), 1 / settling_s
+            driven = np.concatenate([self.rate_per_s, -rate * self.rest[:, None]], axis=1)
+            whole = np.concatenate([driven, np.append(np.zeros(n), -rate)[None]])
+            step, _ = Linear(whole, np.zeros(n + 1), np.zeros(n + 1), 0.0, 0.0)._advance(interval_s, "zero")
+            return step[:, :n, :n], step[:, :n, n] / np.expm1(-rate * interval_s)[:, None]
         longest = float(np.max(interval_s, initial=_EPS))
         norm = float(np.max(np.sum(np.abs(self.rate_per_s * longest), axis=1)))
         doublings = int(np.clip(np.ceil(np.log2(max(norm, _EPS))) + 1, 0, _DOUBLINGS))

@@ -135,8 +135,10 @@ def _joined(parts: Iterable[Any]) -> Linear:
 
 
 def _through(system: Linear, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
-    found, hold = system.respond(interval_s, *signal), signal.hold
-    if len(system.rest):
-        # Behind a step even what comes out of an inertia may have a corner.
-        hold = "first" if hold == "zero" else "smooth"
-    return _NumpySignal(found, system.offset + system.gain * signal.before, hold)
+    found, before = system.respond(interval_s, *signal), system.offset + system.gain * signal.before
+    if len(system.rest) == 0:
+        return signal._replace(values=found, before=before)
+    if len(system.rest) == 1 and signal.hold == "zero":
+        return _NumpySignal(found, before, "first", -1 / system.rate_per_s[0, 0])
+    # Behind a step even what comes out of an inertia may have a corner.
+    return _NumpySignal(found, before, "first" if signal.hold == "zero" else "smooth")

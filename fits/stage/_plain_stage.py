@@ -141,7 +141,7 @@ class PlainStage(PlainModel):
     def _switched(self, voltage: _NumpySignal, initial: str) -> _NumpySignal:
         """What the hysteresis makes of what it sees."""
         displacement = self.law.respond(np.append(voltage.before, voltage.values[:, 0]), initial)[:, None]
-        return _NumpySignal(displacement[1:], displacement[0], voltage.hold)
+        return voltage._replace(values=displacement[1:], before=displacement[0])
 
     def _sd_um(self, known: Directions, record: Record, initial: str, progress: Callable[[str], None]) -> np.ndarray:
         """Standard deviation of the displacement, `(n,)`: to first order in all perturbations."""
@@ -174,17 +174,22 @@ class PlainStage(PlainModel):
         pieces = Path.pieces(extremes_V(initial, *self.law.range_V), voltage_V[: len(record)], _PIECE)
         responses = (surface.respond(piece) for piece in pieces)
         behind = tuple(part for part in self.parts if not part.ahead)
+        between = "zero" if voltage.hold == "zero" else "first", voltage.settling_s
         if any(isinstance(part, PlainEffect) for part in behind):
             around_um = self._switched(voltage, initial).values[:: self.substeps, 0]
             each_s = self.substeps * interval_s[:: self.substeps]
-            yield from _beside(behind, each_s, around_um, responses)
+            yield from _beside(behind, each_s, around_um, responses, between)
             return
         system = around(behind)[1]
-        yield from system.follow(intervals(record.time_s), responses)
+        yield from system.follow(intervals(record.time_s), responses, *between)
 
 
 def _beside(
-    parts: Sequence[PlainPart], interval_s: np.ndarray, around_um: np.ndarray, responses: Iterator[np.ndarray]
+    parts: Sequence[PlainPart],
+    interval_s: np.ndarray,
+    around_um: np.ndarray,
+    responses: Iterator[np.ndarray],
+    between: tuple[str, complex | None],
 ) -> Iterator[np.ndarray]:
     """Pass changes of a signal, `(t,)`, on through parts to first order: what is not linear needs a whole record."""
     whole = np.concatenate(list(responses))
@@ -193,7 +198,7 @@ def _beside(
     for first in range(0, whole.shape[1], _AT_ONCE):
         some = np.pad(whole[:, first : first + _AT_ONCE], behind, mode="edge")
         values = around_um + 1j * _TINY * some
-        found = through(parts, interval_s, _NumpySignal(values, values[0], "first")).values
+        found = through(parts, interval_s, _NumpySignal(values, values[0], *between)).values
         whole[:, first : first + _AT_ONCE] = np.imag(found[:count]) / _TINY
     yield from (whole[first : first + _PIECE] for first in range(0, count, _PIECE))
 

@@ -41,8 +41,9 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
     if samples.has_past and place is not None:
-        past = past_columns(ahead(stage, place, samples))
-        offset = jnp.concatenate([offset, answered(stage, place, samples, past)], axis=1)
+        seen = ahead(stage, place, samples)
+        past = past_columns(seen.values)
+        offset = jnp.concatenate([offset, answered(stage, place, samples, past, seen)], axis=1)
     behind = stage.parts[0 if place is None else place + 1 :]
     if samples.moving:
         time = samples.time_s - samples.time_s.ravel()[0]
@@ -63,13 +64,32 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
 
 
-def answered(stage: m.Stage, place: int, samples: Samples, columns: Float[Array, "m k"]) -> Float[Array, "n k"]:
-    """What a linear chain behind a part makes of signals at the refined times, but for factors, at the samples."""
+def answered(
+    stage: m.Stage,
+    place: int,
+    samples: Samples,
+    columns: Float[Array, "m k"],
+    like: m.Signal,
+) -> Float[Array, "n k"]:
+    """What a linear chain behind a part makes of signals at the refined times, but for factors, at the samples.
+
+    Between these times they run as the one that they are `like` does, a smooth one in lines.
+    """
     system = joined(stage.parts[place + 1 :])
     if system is not None and system.order:
         system = replace(system, offset=jnp.zeros(()))
-        columns = jax.vmap(lambda one: system.respond(samples.time_s, one, one[0]), 1, 1)(columns)
+        hold, settling_s = lines_of(like)
+
+        def respond(one: Float[Array, " m"]) -> Float[Array, " m"]:
+            return system.respond(samples.time_s, one, one[0], hold, False, settling_s)
+
+        columns = jax.vmap(respond, 1, 1)(columns)
     return columns[:: samples.stride]
+
+
+def lines_of(signal: m.Signal) -> tuple[m.Hold, Float[Array, ""] | None]:
+    """How changes of a signal run between its samples: in lines, unless it is held, or settles."""
+    return "zero" if signal.hold == "zero" else "first", signal.settling_s
 
 
 @kept
@@ -158,13 +178,13 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
 
 
 @kept
-def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> Float[Array, " m"]:
+def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> m.Signal:
     """What goes into a part after a rest at the first command, or at another, at the refined times, `(m,)`."""
     signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, samples.hold)
     scene = m.Scene(signal, samples.beside, samples.start.memory)
     for part in stage.parts[:place]:
         signal = part.run(samples.time_s, signal, scene)
-    return signal.values
+    return signal
 
 
 def yields_inside(stage: m.Stage) -> bool:
@@ -199,7 +219,7 @@ def settled_samples(stage: m.Stage, run: Run, initial: str) -> np.ndarray:
         return everything
     # What lags may stand anywhere when the record begins; it has forgotten that where both ends lead to the same.
     rests_V = (jnp.asarray(end_V / run.gain) for end_V in (run.lower_V, run.upper_V))
-    low_V, high_V = (np.asarray(ahead(stage, place, run.samples, rest))[:: run.stride][:n] for rest in rests_V)
+    low_V, high_V = (np.asarray(ahead(stage, place, run.samples, rest).values)[:: run.stride][:n] for rest in rests_V)
     begun = int(np.argmax(np.abs(high_V - low_V) < 1e-3 * (run.upper_V - run.lower_V)))
     settled = np.arange(n) >= begun
     settled[begun:] = known_samples(low_V[begun:], run.lower_V, run.upper_V, initial)

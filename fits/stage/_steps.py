@@ -35,8 +35,8 @@ from microid.effects import EFFECTS
 _EVEN = 1.0
 # How many times what a start leaves, on average, is too much beside one that has a lag of the reading, too.
 _BAD = 3.0
-# Steps per sample that a fit begins with under a command in steps, and takes at most.
-_IN_STEPS, _FINEST = 4, 16
+# Steps per sample that a fit takes at most.
+_FINEST = 16
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,6 @@ class Plan:
     def interval_s(self) -> float:
         """Shortest of the sampling intervals."""
         return min(float(np.median(np.diff(record.time_s))) for record in self.records)
-
-    @property
-    def coarsest(self) -> int:
-        """Steps per sample to begin with: one does not see how a driver answers to a command in steps."""
-        return _IN_STEPS if "zero" in self.holds else 1
 
     def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
         """One of them, its command that much later."""
@@ -134,10 +129,10 @@ def present_problem(plan: Plan, stage: Stage) -> tuple[Plan, Problem]:
         problem = Problem.of(stage, None, np.zeros(0), None, 1.0)
     except ValueError as error:
         raise DataError(f"{error}: thaw some of the stage") from error
-    runs = plan.runs(plan.coarsest)
+    runs = plan.runs(1)
     if yields_inside(stage):
         plan = replace(plan, settled=plan.settled_for(stage, runs))
-        return plan, _best_start(plan, [problem], plan.runs(plan.coarsest)).onward
+        return plan, _best_start(plan, [problem], plan.runs(1)).onward
     drives = hysteresis_alone(stage, runs)
     poles = start_stages(stage, [measure_response(*each) for each in zip(runs, drives, strict=True)])
     problems = [problem, *(replace(problem, z=np.asarray(problem.chain.coordinates.of(one))) for one in poles)]
@@ -167,7 +162,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]  # all others are fast
     fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
-    runs = plan.runs(plan.coarsest)
+    runs = plan.runs(1)
     if fitted is not None:
         name = fitted[0]
         refuse_slopes([plan.records[k] for k in slow])
@@ -308,7 +303,7 @@ def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
 
 def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
     """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
-    stride, refined = plan.coarsest, False
+    stride, refined = 1, False
     while True:
         runs = plan.runs(stride)
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
@@ -330,18 +325,4 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
             return replace(solved, problem=replace(problem, remarks=(*problem.remarks, said))), precision
         stride, refined = min(_FINEST, stride * 2 ** math.ceil(math.log2(excess) / 2)), True
         plan.progress(f"{stride} steps per sample")
-        problem = replace(solved.onward, z=_restart_driver(plan, solved))
-
-
-def _restart_driver(plan: Plan, solved: Solved) -> np.ndarray:
-    """Coordinates to go on from in finer steps: with a driver that is as slow again as they show.
-
-    Whole steps do not see one that answers between two samples, and from no time constant there is no way back.
-    """
-    stage = solved.stage
-    quick = [each for each in named_parts(stage, Driver) if float(each[1].time_constant_s) < 1e-2 * plan.interval_s]
-    if "zero" not in plan.holds or not quick:
-        return solved.z
-    for name, part in quick:
-        stage = stage.swap(name, replace(part, time_constant_s=jnp.asarray(0.3 * plan.interval_s)))
-    return np.asarray(solved.problem.chain.coordinates.of(stage))
+        problem = solved.onward

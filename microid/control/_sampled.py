@@ -37,10 +37,12 @@ class _LinearStep(eqx.Module):
     offset: Float[Array, ""]
 
     @classmethod
-    def of(cls, system: LinearSystem, interval_s: Float[Array, ""], hold: Hold) -> Self:
+    def of(
+        cls, system: LinearSystem, interval_s: Float[Array, ""], hold: Hold, settling_s: Float[Array, ""] | None
+    ) -> Self:
         if system.order == 0:
             return cls(system.rate_per_s, system.rest, system.read, system.gain, system.offset)
-        matrix, push = (x[..., 0] for x in system.advance(interval_s[None], hold))
+        matrix, push = (x[..., 0] for x in system.advance(interval_s[None], hold, settling_s))
         # What a held input changes at once, the interval then lets decay.
         push = matrix @ push if hold == "zero" else push
         return cls(matrix, push, system.read, system.gain, system.offset)
@@ -96,11 +98,14 @@ class SampledStage(AbstractPlant):
         self._substeps = stage.substeps
         links: list[Any] = []
         hold: Hold = "zero"
+        settling_s = None
         names = {id(part): name for name, part in zip(stage.names, stage.parts, strict=True)}
         for link in stage._links():
             if isinstance(link, LinearSystem):
-                links.append(_LinearStep.of(link, self.interval_s / stage.substeps, hold))
-                hold = "first" if link.order else hold
+                links.append(_LinearStep.of(link, self.interval_s / stage.substeps, hold, settling_s))
+                if link.order:
+                    settling_s = -1 / link.rate_per_s[0, 0] if link.order == 1 and hold == "zero" else None
+                    hold = "first"
             elif isinstance(link, AbstractHysteresis):
                 links.append(_step_form(names[id(link)], link))
             else:

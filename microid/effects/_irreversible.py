@@ -27,4 +27,4 @@ def _anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
         share = place - left.astype(low.dtype)
         return mean[left] * (1 - share) + mean[left + 1] * share
 
-    return Signal(at(signal.values), at(signal.before), signal.hold)
+    return signal.with_values(at(signal.values), at(signal.before))

@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from microid._linear import LinearSystem, Times
-from microid._part import Signal
+from microid._part import AbstractPart, Signal, innermost
 from microid._plant import Mechanics
 
 _PIECE, _CORRECTIONS = 256, 2
@@ -17,20 +17,20 @@ Law = Callable[[Array, Array, Any], tuple[Array, Any]]
 
 
 def _propagators(
-    system: LinearSystem, time_s: Times, count: int
+    system: LinearSystem, time_s: Times, count: int, settling_s: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, "k n n"], Float[Array, "k n"]]:
-    """Matrix of every interval, and what its states lose by an input that rises by one in a line."""
+    """Matrix of every interval, and what its states lose by an input that rises by one, in a line or settling."""
     intervals, n = count - 1, system.order
     time = lax.stop_gradient(time_s).astype(system.rest.dtype)
 
     def even(interval: Array) -> tuple[Array, Array]:
-        step, taken = (x[..., 0] for x in system.advance(interval[None], "first"))
+        step, taken = (x[..., 0] for x in system.advance(interval[None], "first", settling_s))
         return jnp.broadcast_to(step, (intervals, n, n)), jnp.broadcast_to(taken, (intervals, n))
 
     def uneven(interval: Array) -> tuple[Array, Array]:
         pieces = -(-intervals // _PIECE)
         filled = jnp.pad(interval, (0, pieces * _PIECE - intervals), mode="edge").reshape(pieces, _PIECE)
-        every = lax.map(lambda piece: system.advance(piece, "first"), filled)
+        every = lax.map(lambda piece: system.advance(piece, "first", settling_s), filled)
         step, taken = (jnp.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[:intervals] for x in every)
         return step, taken
 
@@ -68,14 +68,16 @@ def _forces_um(
     if signal.values.shape[0] == 1:
         return before_um[None]
     gain = mechanics.gain
-    step, taken = _propagators(mechanics.system(), time_s, signal.values.shape[0])
-    change = jnp.diff(signal.values)
+    system, count = mechanics.system(), signal.values.shape[0]
+    step, taken = _propagators(system, time_s, count)
+    behind = taken if signal.settling_s is None else _propagators(system, time_s, count, signal.settling_s)[1]
+    driven = behind * jnp.diff(signal.values)[:, None]
 
     def visit(carry: tuple[Any, ...], now: tuple[Array, ...]) -> tuple[tuple[Any, ...], Array]:
         place, speed, moved, force, memory = carry
-        matrix, loss, rise, level = now
-        free_place = matrix[0, 0] * place + matrix[0, 1] * speed - loss[0] * rise
-        free_speed = matrix[1, 0] * place + matrix[1, 1] * speed - loss[1] * rise
+        matrix, loss, lost, level = now
+        free_place = matrix[0, 0] * place + matrix[0, 1] * speed - lost[0]
+        free_speed = matrix[1, 0] * place + matrix[1, 1] * speed - lost[1]
         later, kept = force, memory
         for _ in range(_CORRECTIONS):
             there = gain * (level - later + free_place + loss[0] * (later - force))
@@ -86,5 +88,17 @@ def _forces_um(
     first = signal.values[0]
     rest = gain * (signal.before - before_um)
     start = (signal.before - first, jnp.zeros_like(first), rest, before_um, state)
-    _, forces = lax.scan(visit, start, (step, taken, change, signal.values[1:]))
+    _, forces = lax.scan(visit, start, (step, taken, driven, signal.values[1:]))
     return jnp.concatenate([before_um[None], forces])
+
+
+def _braked(
+    inner: AbstractPart, time_s: Times, signal: Signal, start: Any, taken_um: Float[Array, " t"], before_um: Array
+) -> Signal:
+    """Pass a signal on through mechanics that forces, which run in lines, take something from; see `_forces_um`."""
+    if signal.settling_s is None:
+        return inner.run(time_s, signal.with_values(signal.values - taken_um, signal.before - before_um), start)
+    # The signal settles within each interval, and the forces do not.
+    given = inner.run(time_s, signal, start)
+    less = innermost(inner).run(time_s, Signal(taken_um, before_um, "first"))
+    return given.with_values(given.values - less.values, given.before - less.before)

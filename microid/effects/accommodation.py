@@ -65,8 +65,8 @@ class Accommodation(AbstractEffect):
         def improve(found: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             more = self.feedback_V_per_um * (found[0] - straight.values)
             before = self.feedback_V_per_um * (found[1] - straight.before)
-            given = self.inner.run(time_s, Signal(signal.values + more, signal.before + before, signal.hold), start)
+            given = self.inner.run(time_s, signal.with_values(signal.values + more, signal.before + before), start)
             return (given.values, given.before), None
 
         (values, before), _ = lax.scan(improve, (straight.values, straight.before), None, length=_PASSES + 1)
-        return Signal(values, before, signal.hold)
+        return signal.with_values(values, before)

@@ -114,4 +114,4 @@ def _path_V(command_V: Float[Array, " t"]) -> Float[Array, " t"]:
 
 def _scaled(signal: Signal, more: Float[Array, " t"], zero_um: Float[Array, ""]) -> Signal:
     factor = more / jnp.log(10.0)
-    return Signal(signal.values + factor * (signal.values - zero_um), signal.before, signal.hold)
+    return signal.with_values(signal.values + factor * (signal.values - zero_um), signal.before)

@@ -40,7 +40,7 @@ class _AbstractBacklash(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Drag the output along."""
         place = signal.before + self.start * self.half_gap_um
-        return Signal(_plays(signal.values, self.half_gap_um[None], place[None])[:, 0], place, signal.hold)
+        return signal.with_values(_plays(signal.values, self.half_gap_um[None], place[None])[:, 0], place)
 
 
 @register

@@ -101,7 +101,7 @@ class BoucWenHysteresis(AbstractEffect):
             state = self._along(state, jnp.append(past, signal.before), _PAST_SUBSTEPS)[-1]
         state = jnp.clip(state + self.before, self._limit(-1.0), self._limit(1.0))
         states = self._along(state, jnp.concatenate([signal.before[None], signal.values]), _SUBSTEPS)
-        return Signal(given.values - self.amplitude_um * states, given.before - self.amplitude_um * state, given.hold)
+        return given.with_values(given.values - self.amplitude_um * states, given.before - self.amplitude_um * state)
 
     def _limit(self, way: float) -> Float[Array, ""]:
         """What the state approaches as the voltage goes up or down."""

@@ -45,7 +45,7 @@ class ClockMismatch(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Read the signal at the times of the other clock."""
         when = _times_of(time_s, signal.values.shape[0]) * (1 + 1e-6 * self.rate_ppm)
-        return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)
+        return signal.with_values(_read_at(time_s, signal, when), signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Read the signal at the times of the other clock."""

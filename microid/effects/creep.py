@@ -82,7 +82,7 @@ class Creep(AbstractEffect):
         crept = self.gain_per_decade * _crept(time_s, signal.values - signal.before, self.onset_s)
         time = _times_of(time_s, crept.shape[0])
         gone_on = _gone_on(time, self.recent_um, self.recent_s) + _gone_on(time, self.older_um, self.older_s)
-        return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
+        return signal.with_values(signal.values + crept + gone_on, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add creep to a displacement that was at rest."""
@@ -146,7 +146,7 @@ class VoltageCreep(AbstractEffect):
         crept = self.gain_per_decade * _crept(time_s, signal.values - signal.before, self.onset_s)
         time = _times_of(time_s, crept.shape[0])
         gone_on = _gone_on(time, self.recent_V, self.recent_s) + _gone_on(time, self.older_V, self.older_s)
-        return Signal(signal.values + crept + gone_on, signal.before, signal.hold)
+        return signal.with_values(signal.values + crept + gone_on, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add creep to a voltage that was constant."""
@@ -203,7 +203,7 @@ class KelvinVoigtCreep(AbstractEffect):
         """Add creep to a displacement that was at rest."""
         moved = self.gain * _lowpass(time_s, signal.values - signal.before, self.time_constant_s)
         late = -self.before_um * jnp.expm1(-_times_of(time_s, moved.shape[0]) / self.time_constant_s)
-        return Signal(signal.values + moved + late, signal.before, signal.hold)
+        return signal.with_values(signal.values + moved + late, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add creep to a displacement that was at rest."""

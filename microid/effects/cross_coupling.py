@@ -44,7 +44,7 @@ class CrossCoupling(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the share."""
         more = self.gain * start.columns["other_um"]
-        return Signal(signal.values + more, signal.before + more[0], signal.hold)
+        return signal.with_values(signal.values + more, signal.before + more[0])
 
 
 @register
@@ -81,7 +81,7 @@ class QuadraticCrossCoupling(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the shortening."""
         more = self.curvature_per_um * start.columns["other_um"] ** 2
-        return Signal(signal.values + more, signal.before + more[0], signal.hold)
+        return signal.with_values(signal.values + more, signal.before + more[0])
 
 
 def _spread_um(scales: Scales) -> float:

@@ -53,13 +53,13 @@ class DriverSaturation(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is above the rail."""
         values, before = (jnp.minimum(x, self.rail_V) for x in (signal.values, signal.before))
-        return Signal(values, before, signal.hold)
+        return signal.with_values(values, before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Cut off what is above the rail."""
         rail_V: Any = self.rail_V
         values, before = (np.where(x.real < rail_V.real, x, rail_V) for x in (signal.values, signal.before))
-        return _NumpySignal(values, before, signal.hold)
+        return signal._replace(values=values, before=before)
 
 
 @register
@@ -95,10 +95,10 @@ class LowerDriverSaturation(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is below the rail."""
         values, before = (jnp.maximum(x, self.rail_V) for x in (signal.values, signal.before))
-        return Signal(values, before, signal.hold)
+        return signal.with_values(values, before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Cut off what is below the rail."""
         rail_V: Any = self.rail_V
         values, before = (np.where(x.real > rail_V.real, x, rail_V) for x in (signal.values, signal.before))
-        return _NumpySignal(values, before, signal.hold)
+        return signal._replace(values=values, before=before)

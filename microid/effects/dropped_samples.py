@@ -62,7 +62,7 @@ class DroppedSamples(AbstractEffect):
         time = _times_of(time_s, signal.values.shape[0])
         width = time[1] - time[0] if time.shape[0] > 1 else jnp.ones_like(self.after_s)
         when = time + self.dropped_s * jax.nn.sigmoid((time - self.after_s) / width)
-        return Signal(_read_at(time_s, signal, when), signal.before, signal.hold)
+        return signal.with_values(_read_at(time_s, signal, when), signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Read the signal at later times after the loss."""

@@ -11,7 +11,7 @@ from microid._param import param
 from microid._part import AbstractPart, Signal, innermost
 from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._grids import _decades
-from microid.effects._oscillator import _forces_um
+from microid.effects._oscillator import _braked, _forces_um
 
 _SMALL = 1e-6
 
@@ -75,7 +75,7 @@ class Friction(AbstractEffect):
 
         none = jnp.zeros_like(signal.before)
         taken = _forces_um(mechanics, time_s, signal, law, none, none)
-        return self.inner.run(time_s, Signal(signal.values - taken, signal.before, signal.hold), start)
+        return _braked(self.inner, time_s, signal, start, taken, none)
 
 
 def _over(function: Callable[[Array], Array], x: Array, bend: float) -> Array:
@@ -155,4 +155,4 @@ class BoucWenForce(AbstractEffect):
 
         none = jnp.zeros_like(signal.before)
         taken_um = _forces_um(mechanics, time_s, signal, law, none, none)
-        return self.inner.run(time_s, Signal(signal.values - taken_um, signal.before, signal.hold), start)
+        return _braked(self.inner, time_s, signal, start, taken_um, none)

@@ -53,10 +53,10 @@ class InitialState(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Put the way from that voltage ahead of the record."""
         high = signal.before + self.excess_V
-        longer = Signal(jnp.concatenate([signal.before[None], signal.values]), high, signal.hold)
+        longer = signal.with_values(jnp.concatenate([signal.before[None], signal.values]), high)
         time = time_s
         if time.ndim == 1:
             ahead = time[1] - time[0] if time.shape[0] > 1 else jnp.ones_like(time[0])
             time = jnp.concatenate([(time[0] - ahead)[None], time])
         given = self.inner.run(time, longer, start)
-        return Signal(given.values[1:], given.values[0], given.hold)
+        return given.with_values(given.values[1:], given.values[0])

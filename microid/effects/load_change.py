@@ -117,7 +117,7 @@ def _loaded(
         since = jnp.maximum(time - after_s, 0.0)
         more = jnp.where(time >= after_s, more - _decay(loaded, since, *_at(after_s, time, more)), 0.0)
     other = inner.run(time_s, signal, start)
-    return Signal(other.values + more, other.before, other.hold)
+    return other.with_values(other.values + more, other.before)
 
 
 def _at(

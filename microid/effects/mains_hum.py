@@ -140,7 +140,7 @@ def _hum(
     total = signal.values
     for h in range(_HARMONICS):
         total = total + cosine_um[h] * jnp.cos((h + 1) * phase) + sine_um[h] * jnp.sin((h + 1) * phase)
-    return Signal(total, signal.before, signal.hold)
+    return signal.with_values(total, signal.before)
 
 
 def _hum_in_numpy(

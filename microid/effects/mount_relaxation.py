@@ -54,7 +54,7 @@ class MountRelaxation(AbstractEffect):
         """Add what has settled since the first sample."""
         time = _times_of(time_s, signal.values.shape[0])
         moved = -self.change_um * jnp.expm1(-time / self.time_constant_s)
-        return Signal(signal.values + moved, signal.before, signal.hold)
+        return signal.with_values(signal.values + moved, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add what has settled since the first sample."""
@@ -100,7 +100,7 @@ class LogarithmicMountRelaxation(AbstractEffect):
         """Add what has settled since the first sample."""
         time = _times_of(time_s, signal.values.shape[0])
         moved = self.change_per_decade_um * jnp.log1p(time / self.age_s) / jnp.log(10.0)
-        return Signal(signal.values + moved, signal.before, signal.hold)
+        return signal.with_values(signal.values + moved, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add what has settled since the first sample."""

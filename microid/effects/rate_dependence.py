@@ -79,7 +79,7 @@ class RateDependence(AbstractEffect):
         beside = given.values - _anhysteretic(self.inner, signal, start).values
         speed = jnp.log1p(jnp.abs(_rate_of(time_s, signal.values)) / self.onset_V_per_s) / jnp.log(10.0)
         wider = _lowpass(time_s, speed, jnp.asarray(_LAG_S, dtype=speed.dtype))
-        return Signal(given.values + self.gain_per_decade * wider * beside, given.before, given.hold)
+        return given.with_values(given.values + self.gain_per_decade * wider * beside, given.before)
 
 
 @register
@@ -125,7 +125,7 @@ class RelaxingHysteresis(AbstractEffect):
         given = self.inner.run(time_s, signal, start)
         beside = given.values - _anhysteretic(self.inner, signal, start).values
         late = _lowpass(time_s, beside, self.time_constant_s)
-        return Signal(given.values + self.share * (late - beside), given.before, given.hold)
+        return given.with_values(given.values + self.share * (late - beside), given.before)
 
 
 @register
@@ -182,10 +182,10 @@ class ActivatedSwitching(AbstractEffect):
             return self.inner.run(time_s, signal, start)
         rate = _lowpass(time_s, _rate_of(time_s, signal.values), self.response_s)
         behind = signal.values - self.lag_V * jnp.arcsinh(rate / self.onset_V_per_s)
-        given = self.inner.run(time_s, Signal(behind, signal.before, signal.hold), start)
+        given = self.inner.run(time_s, signal.with_values(behind, signal.before), start)
         law = innermost(self.inner)
         if not isinstance(law, Preisach):
             return given
         # What has no loop has no walls that could be late.
         memoryless = law.reversible(signal.values) - law.reversible(behind)
-        return Signal(given.values + memoryless, given.before, given.hold)
+        return given.with_values(given.values + memoryless, given.before)

@@ -70,7 +70,7 @@ class SecondResonance(AbstractEffect):
         first = self.inner.run(time_s, signal, start)
         mode = Mechanics(self.frequency_Hz, self.damping_ratio)
         more = innermost(self.inner).gain * mode.run(time_s, signal, start).values - first.values
-        return Signal(first.values + self.share * more, first.before, first.hold)
+        return first.with_values(first.values + self.share * more, first.before)
 
 
 @register
@@ -122,4 +122,4 @@ class AddedResonance(AbstractEffect):
         first = self.inner.run(time_s, signal, start)
         mode = Mechanics(self.frequency_Hz, self.damping_ratio)
         more = innermost(self.inner).gain * (mode.run(time_s, signal, start).values - signal.values)
-        return Signal(first.values + self.share * more, first.before, first.hold)
+        return first.with_values(first.values + self.share * more, first.before)

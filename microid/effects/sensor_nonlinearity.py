@@ -56,11 +56,11 @@ class SensorNonlinearity(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Bend the reading."""
-        return Signal(_bent(self, signal.values), _bent(self, signal.before), signal.hold)
+        return signal.with_values(_bent(self, signal.values), _bent(self, signal.before))
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Bend the reading."""
-        return _NumpySignal(_bent(self, signal.values), _bent(self, signal.before), signal.hold)
+        return signal._replace(values=_bent(self, signal.values), before=_bent(self, signal.before))
 
 
 def _bent(effect: Any, reading: Any) -> Any:

@@ -66,7 +66,7 @@ class SlewLimit(AbstractEffect):
             after = jnp.clip(target, before - most, before + most)
             return after, after
 
-        return Signal(lax.scan(visit, signal.before, (signal.values, reach))[1], signal.before, signal.hold)
+        return signal.with_values(lax.scan(visit, signal.before, (signal.values, reach))[1], signal.before)
 
 
 @register
@@ -118,7 +118,7 @@ class CurrentLimit(AbstractEffect):
         if signal.values.shape[0] == 1:
             return given
         limited, free = (self._followed(time_s, signal, limit) for limit in (self.limit_V_per_s, jnp.inf))
-        return Signal(given.values + limited - free, given.before, given.hold)
+        return given.with_values(given.values + limited - free, given.before)
 
     def _followed(self, time_s: Times, signal: Signal, limit: Any) -> Float[Array, " t"]:
         driver = innermost(self.inner)

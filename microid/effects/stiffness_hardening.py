@@ -9,7 +9,7 @@ from microid._linear import Times
 from microid._param import array, param
 from microid._part import AbstractPart, Signal, innermost
 from microid.effects._base import AbstractEffect, Place, Scales, View, register
-from microid.effects._oscillator import _forces_um
+from microid.effects._oscillator import _braked, _forces_um
 
 _AT_REST = 8
 
@@ -80,4 +80,4 @@ class StiffnessHardening(AbstractEffect):
         for _ in range(_AT_REST):
             before, _ = law(before, mechanics.gain * (signal.before - before), ())
         taken = _forces_um(mechanics, time_s, signal, law, before, ())
-        return self.inner.run(time_s, Signal(signal.values - taken, signal.before - before, signal.hold), start)
+        return _braked(self.inner, time_s, signal, start, taken, before)

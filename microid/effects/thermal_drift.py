@@ -56,7 +56,7 @@ class ThermalDrift(AbstractEffect):
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Add the drift since the first sample."""
         time = _times_of(time_s, signal.values.shape[0])
-        return Signal(signal.values + self.rate_um_per_s * time, signal.before, signal.hold)
+        return signal.with_values(signal.values + self.rate_um_per_s * time, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add the drift since the first sample."""
@@ -103,7 +103,7 @@ class ExponentialThermalDrift(AbstractEffect):
         """Add the drift since the first sample."""
         time = _times_of(time_s, signal.values.shape[0])
         moved = -self.change_um * jnp.expm1(-time / self.time_constant_s)
-        return Signal(signal.values + moved, signal.before, signal.hold)
+        return signal.with_values(signal.values + moved, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Add the drift since the first sample."""
@@ -159,4 +159,4 @@ class TemperatureDrift(AbstractEffect):
         temperature = start.columns["temperature_degC"]
         followed = self.expansion_um_per_K * _lowpass(time_s, temperature - temperature[0], self.time_constant_s)
         late = -self.before_um * jnp.expm1(-_times_of(time_s, followed.shape[0]) / self.time_constant_s)
-        return Signal(signal.values + followed + late, signal.before, signal.hold)
+        return signal.with_values(signal.values + followed + late, signal.before)

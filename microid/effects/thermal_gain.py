@@ -76,7 +76,7 @@ class ThermalGain(AbstractEffect):
         late = self.before_K * jnp.exp(-_times_of(time_s, above.shape[0]) / self.time_constant_s)
         more = self.gain_per_K * (above + late)
         before = signal.before + more[0] * (signal.before - self.zero_um)
-        return Signal(signal.values + more * (signal.values - self.zero_um), before, signal.hold)
+        return signal.with_values(signal.values + more * (signal.values - self.zero_um), before)
 
 
 @register
@@ -133,7 +133,7 @@ class SelfHeating(AbstractEffect):
         losses = jnp.abs(command * _rate_of(time_s, command)) / self.reference_V2_per_s
         # The part before the record was at rest, and cold.
         heat = _lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
-        return Signal(signal.values + self.gain * heat * (signal.values - self.zero_um), signal.before, signal.hold)
+        return signal.with_values(signal.values + self.gain * heat * (signal.values - self.zero_um), signal.before)
 
 
 @register
@@ -181,4 +181,4 @@ class ApproachingGain(AbstractEffect):
         time = _times_of(time_s, signal.values.shape[0])
         more = self.gain * jnp.exp(-time / self.time_constant_s)
         before = signal.before + self.gain * (signal.before - self.zero_um)
-        return Signal(signal.values + more * (signal.values - self.zero_um), before, signal.hold)
+        return signal.with_values(signal.values + more * (signal.values - self.zero_um), before)

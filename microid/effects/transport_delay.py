@@ -56,8 +56,8 @@ class TransportDelay(AbstractEffect):
         when = time - self.delay_s
         # Beside what was there before, the signal starts from rest.
         rest = signal.values - self.before_um_per_s * time
-        read = _read_at(time_s, Signal(rest, signal.before, signal.hold), when)
-        return Signal(read + self.before_um_per_s * when, signal.before, signal.hold)
+        read = _read_at(time_s, signal.with_values(rest, signal.before), when)
+        return signal.with_values(read + self.before_um_per_s * when, signal.before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Read the signal as it was before."""

@@ -62,7 +62,7 @@ class VoltageDependentCapacitance(AbstractEffect):
         """Follow the command; the driver's own answer and what the capacitance adds to it."""
         given = self.inner.run(time_s, signal, start)
         more = self._followed(time_s, signal, self.slope) - self._followed(time_s, signal, jnp.zeros_like(self.slope))
-        return Signal(given.values + more, given.before, given.hold)
+        return given.with_values(given.values + more, given.before)
 
     def _followed(self, time_s: Times, signal: Signal, slope: Float[Array, ""]) -> Float[Array, " t"]:
         driver = innermost(self.inner)
