@@ -161,20 +161,22 @@ def fit_baseline(
         return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
     solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
     prior = prior_precision(chain, solved.hyper, stroke_um)
-    stride = solved.runs[0].stride
 
-    def prepared(many: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        held = _prepared(aside, range_V, initial, 0.0, many, past, held_holds)
+    strides = [run.stride for run in solved.runs]
+
+    def prepared(least: int, most: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
+        many = [int(np.clip(stride, least, most)) for stride in (*strides, *[max(strides)] * len(aside))]
+        held = _prepared(aside, range_V, initial, 0.0, many[len(strides) :], past, held_holds)
         return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
-    asked = _prepared(aside, range_V, initial, 0.0, _FINE, False)
+    asked = _prepared(aside, range_V, initial, 0.0, [_FINE] * len(aside), False)
     held_holds = [_hold_of(solved.stage, run, better) for run in asked]
-    (runs, held), (finest, finest_held) = prepared(stride), prepared(max(stride, _FINE))
+    (runs, held), (finest, finest_held) = prepared(1, max(strides)), prepared(_FINE, max(*strides, _FINE))
     # Behind a step a reading has corners that whole steps do not show to what reads it between samples.
-    few = _COARSE if "zero" in (*holds, *held_holds) else min(stride, _COARSE)
+    few = _COARSE if "zero" in (*holds, *held_holds) else 1
     return Baseline(
         *(chain, solved.z, solved.columns_um, prior, stroke_um, range_V, runs, held),
-        *prepared(few),
+        *prepared(few, _COARSE),
         *(finest, finest_held),
         tuple(map(partial(_with_enough_steps, solved.stage), runs, finest)),
         tuple(map(partial(_with_enough_steps, solved.stage), held, finest_held)),
@@ -218,13 +220,14 @@ def _prepared(
     range_V: tuple[float, float],
     initial: str,
     holdout: float,
-    stride: int,
+    strides: Sequence[int],
     estimated: bool,
     holds: Sequence[Hold] = (),
 ) -> tuple[Run, ...]:
     lines: list[Hold] = ["first"] * len(records)
-    settings, each = (range_V, initial, holdout, stride), zip(records, holds or lines, strict=True)
-    return tuple(prepare_run(record, *settings, hold=hold, estimated=estimated) for record, hold in each)
+    each = zip(records, strides, holds or lines, strict=False)
+    settings = range_V, initial, holdout
+    return tuple(prepare_run(one, *settings, stride, hold=hold, estimated=estimated) for one, stride, hold in each)
 
 
 def _hold_of(stage: Stage, run: Run, least: float) -> Hold:
@@ -262,8 +265,8 @@ def _static(
     progress: Callable[[str], None],
 ) -> Baseline:
     ready, held = (
-        _prepared(records, range_V, initial, holdout, 1, past),
-        _prepared(aside, range_V, initial, 0.0, 1, past),
+        _prepared(records, range_V, initial, holdout, [1] * len(records), past),
+        _prepared(aside, range_V, initial, 0.0, [1] * len(aside), past),
     )
     stroke, tried, _ = choose_grid(list(ready), None, progress, _FINEST)
     grid = tried.data.grid

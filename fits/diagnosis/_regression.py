@@ -86,7 +86,7 @@ def regress(
         run: Run, many: Run, few: Run, own: Sequence[AbstractEffect]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         here = with_effects_in(chain, baseline.z, saturating(own))
-        _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run)
+        _, slope, free = linearise(chain, z, jnp.asarray(baseline.columns_um), run.coarser)
         n = len(run.record)
         both = np.empty((n, chain.size + slope.shape[1]))
         # A lag of the sensor and one of the driver do nearly the same, so that telling them apart takes derivatives

@@ -1,7 +1,7 @@
 """A record made ready for fitting: which samples count, what it began from, and the arrays that models take."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,6 +29,8 @@ _FEWEST = 50
 _SHORTEST = 4096
 # Part of the way to it by which peaks of smooth commands miss their highest.
 _ALMOST = 1e-2
+# Steps between samples that show derivatives well enough.
+_FEW_STEPS = 4
 # Told what is being done, a sentence at a time.
 Progress = Callable[[str], None]
 
@@ -122,6 +124,11 @@ class Run:
     def extremes_V(self) -> np.ndarray:
         """Extremes of the memory before the first sample, oldest first."""
         return np.asarray(self.start.extremes_V)[: int(self.start.count)]
+
+    @cached_property
+    def coarser(self) -> "Run":
+        """The same in few steps: enough for derivatives, which are directions to move in."""
+        return self if self.stride <= _FEW_STEPS else replace(self, stride=_FEW_STEPS)
 
     @cached_property
     def path(self) -> tuple[Path, ...]:

@@ -134,7 +134,7 @@ def fit_without_delays(
     # measure it by a delay is part of the lag.
     if "zero" in plan.holds:
         return None
-    start = solved.onward
+    start, strides = solved.onward, [run.stride for run in solved.runs]
     if start.least_noise_share:
         # Unless much is left, which may hide the resonance that was not found.
         gross = max(one.share_pct for one in left) > GROSS_PCT
@@ -145,7 +145,7 @@ def fit_without_delays(
     found: Solved | None = solved
     if searched is not None:
         shifts, start = searched
-        found = _solved_with(plan, start, solved.runs[0].stride, shifts)
+        found = _solved_with(plan, start, strides, shifts)
     elif precision is None or not any(one.seen for one in _scores(plan, solved, shifts)):
         return None
     if found is None:
@@ -165,7 +165,7 @@ def fit_without_delays(
         for _ in range(4):  # halvings
             plan.progress(f"taking out delays of {', '.join(f'{1e3 * s:.4g}' for s in shifts + step)} ms")
             start = replace(start, z=found.z, columns_um=found.columns_um)
-            again = _solved_with(plan, start, solved.runs[0].stride, shifts + step)
+            again = _solved_with(plan, start, strides, shifts + step)
             if again is not None and again.weighing.noise_um[first] <= 1.01 * found.weighing.noise_um[first]:
                 break
             step /= 2
@@ -187,9 +187,9 @@ def fit_without_delays(
     return WithoutDelays(seen, found)
 
 
-def _solved_with(plan: Plan, start: Problem, stride: int, shifts_s: np.ndarray) -> Solved | None:
+def _solved_with(plan: Plan, start: Problem, strides: Sequence[int], shifts_s: np.ndarray) -> Solved | None:
     """Fit again with the command of each run that much later, as well as can be; None where that fails."""
-    return try_chain(start, plan.shifted(shifts_s).runs(stride), plan.loss, plan.progress, accept_best=True)
+    return try_chain(start, plan.shifted(shifts_s).runs(strides), plan.loss, plan.progress, accept_best=True)
 
 
 def _scores(plan: Plan, solved: Solved, shifts: np.ndarray) -> list[Delay]:
@@ -206,11 +206,11 @@ def _scores(plan: Plan, solved: Solved, shifts: np.ndarray) -> list[Delay]:
         late, early = (simulate_stage(stage, plan.run(k, run.stride, shifts[k] + sign * step)) for sign in (1, -1))
         full = np.zeros(run.samples.weight.shape[0])
         full[:n] = (late - early) / (2 * step)
-        nuisance = jnp.asarray(nuisance_columns(stage, run.samples))
+        nuisance = jnp.asarray(nuisance_columns(stage, run.coarser.samples))
         late_um_per_s = np.asarray(project_out(nuisance, run.samples.weight, jnp.asarray(full)))[:n]
         worth = solved.weighing.shares[k] / precision.variance
         weighed = worth * weight * late_um_per_s
-        _, slope, _ = linearise(chain, *here, run)
+        _, slope, _ = linearise(chain, *here, run.coarser)
         border = np.concatenate([np.zeros(size), slope[:n].T @ weighed])
         for first, columns in pieces(chain, here[0], run, True):
             border[:size] += columns.T @ weighed[first : first + len(columns)]
@@ -248,7 +248,7 @@ def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray,
             plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
             turn = np.exp(2j * np.pi * response.frequency_Hz * shift)
             moved = replace(response, response=response.response * turn, sampled=None)
-            runs = plan.shifted(there).runs(run.stride)
+            runs = plan.shifted(there).runs([one.stride for one in solved.runs])
             for candidate in start_stages(stage, [moved])[:1]:
                 z = np.asarray(problem.chain.coordinates.of(candidate))
                 start = replace(problem, z=z, columns_um=columns_um, hyper=None)

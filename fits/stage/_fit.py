@@ -117,7 +117,7 @@ def fit_stage(
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     before, stage = initial if isinstance(initial, str) else "unknown", solved.stage
-    settings = before, 1.0, runs[-1].stride, gain_ahead(stage), stage.hold
+    settings = before, 1.0, max(run.stride for run in runs), gain_ahead(stage), stage.hold
     held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
     if yields_inside(stage):
         held = [replace(run, known=run.known & settled_samples(stage, run, before)) for run in held]

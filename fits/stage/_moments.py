@@ -45,7 +45,9 @@ def run_sums(
 ) -> RunSums:
     """Pass one run through the regression on coordinates and, if they are `free`, columns, linearised there."""
     samples, size = run.samples, chain.size if free else 0
-    out, slope, nuisance = linearise(chain, z, columns_um, run)
+    out, slope, nuisance = linearise(chain, z, columns_um, run.coarser)
+    if run.coarser is not run:
+        out = np.asarray(respond(chain.stage(z, columns_um), samples))
     weight = np.asarray(samples.weight)
     residual = np.asarray(samples.displacement_um) - out
     root = np.sqrt(weight)

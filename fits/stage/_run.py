@@ -24,6 +24,7 @@ from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare
 _TINY = 1e-12
 
 
+@kept
 def respond(stage: m.Stage, samples: Samples) -> Float[Array, " n"]:
     """Simulate a run, in um, shape `(n,)`."""
     start = samples.start if any(isinstance(m.innermost(part), m.Preisach) for part in stage.parts) else m.Start()
@@ -104,20 +105,17 @@ def project_out(
     return values - scaled @ jnp.linalg.solve(gram, weighted.T @ values)
 
 
-@kept
-def _compare(stage: m.Stage, samples: Samples) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    out = respond(stage, samples)
-    return out, project_out(nuisance_columns(stage, samples), samples.weight, samples.displacement_um - out)
-
-
 def simulate_stage(stage: m.Stage, run: Run) -> np.ndarray:
     """Predict the displacement of a run, in um, shape `(n,)`."""
-    return np.asarray(_compare(stage, run.samples)[0])[: len(run.record)]
+    return np.asarray(respond(stage, run.samples))[: len(run.record)]
 
 
 def residual_of(stage: m.Stage, run: Run) -> np.ndarray:
     """Measurement less prediction, the run's nuisance parameters taken off, in um, shape `(n,)`."""
-    return np.asarray(_compare(stage, run.samples)[1])[: len(run.record)]
+    samples = run.samples
+    columns = nuisance_columns(stage, run.coarser.samples)
+    left = project_out(columns, samples.weight, samples.displacement_um - respond(stage, samples))
+    return np.asarray(left)[: len(run.record)]
 
 
 def place_of_hysteresis(stage: m.Stage) -> int | None:

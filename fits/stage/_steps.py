@@ -60,10 +60,10 @@ class Plan:
     shifts_s: tuple[float, ...] = ()
     settled: tuple[np.ndarray, ...] = ()
 
-    def runs(self, stride: int) -> list[Run]:
-        """The records, each interval divided into so many steps."""
-        shifts = self.shifts_s or (0.0,) * len(self.records)
-        return [self.run(k, stride, shift) for k, shift in enumerate(shifts)]
+    def runs(self, strides: Sequence[int] = ()) -> list[Run]:
+        """The records, the intervals of each divided into so many steps, or not at all."""
+        shifts, each = self.shifts_s or (0.0,) * len(self.records), strides or (1,) * len(self.records)
+        return [self.run(k, *both) for k, both in enumerate(zip(each, shifts, strict=True))]
 
     @property
     def interval_s(self) -> float:
@@ -129,10 +129,10 @@ def present_problem(plan: Plan, stage: Stage) -> tuple[Plan, Problem]:
         problem = Problem.of(stage, None, np.zeros(0), None, 1.0)
     except ValueError as error:
         raise DataError(f"{error}: thaw some of the stage") from error
-    runs = plan.runs(1)
+    runs = plan.runs()
     if yields_inside(stage):
         plan = replace(plan, settled=plan.settled_for(stage, runs))
-        return plan, _best_start(plan, [problem], plan.runs(1)).onward
+        return plan, _best_start(plan, [problem], plan.runs()).onward
     drives = hysteresis_alone(stage, runs)
     poles = start_stages(stage, [measure_response(*each) for each in zip(runs, drives, strict=True)])
     problems = [problem, *(replace(problem, z=np.asarray(problem.chain.coordinates.of(one))) for one in poles)]
@@ -162,7 +162,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     slow = [k for k, one in enumerate(speed) if one <= 4.0 * min(speed)]  # all others are fast
     fitted = free_grid(stage)
     grid, columns, hyper, stroke = None, np.zeros(0), None, 1.0
-    runs = plan.runs(1)
+    runs = plan.runs()
     if fitted is not None:
         name = fitted[0]
         refuse_slopes([plan.records[k] for k in slow])
@@ -303,26 +303,29 @@ def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
 
 def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
     """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
-    stride, refined = 1, False
+    strides, refined = [1] * len(plan.records), False
     while True:
-        runs = plan.runs(stride)
+        runs = plan.runs(strides)
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
         precision = Precision(solved)
         inside = yields_inside(solved.stage)
         if not inside and (plan.gain is None or refined):
             return solved, precision
-        moved = np.zeros(len(solved.z))
-        for own, run, halved in zip(precision.influence, runs, plan.runs(2 * stride), strict=True):
-            off = simulate_stage(solved.stage, run) - simulate_stage(solved.stage, halved)
-            moved += own @ (off - off[run.fitted].mean())
-        # Halving the step takes three quarters of its error off, which falls with its square; it may move a parameter
-        # by 0.15 standard deviations.
-        excess = float(np.max(np.abs(moved) / precision.sd)) / (0.75 * 0.15)
-        if excess <= 1:
+        moved, halved = np.zeros((len(runs), len(solved.z))), plan.runs([2 * stride for stride in strides])
+        for k, (own, run, finer) in enumerate(zip(precision.influence, runs, halved, strict=True)):
+            off = simulate_stage(solved.stage, run) - simulate_stage(solved.stage, finer)
+            moved[k] = own @ (off - off[run.fitted].mean())
+        # Halving the step takes three quarters of its error off, which falls with its square; the steps of all runs
+        # together may move a parameter by 0.15 standard deviations.
+        whole, each = (np.max(np.abs(m) / precision.sd, -1) / (0.75 * 0.15) for m in (moved.sum(axis=0), moved))
+        if whole <= 1:
             return solved, precision
-        if stride == _FINEST:
-            said = f"{stride} steps per sample are few: more would move a parameter by {0.15 * excess:.2g} sd"
+        if max(strides) == _FINEST:
+            said = f"{_FINEST} steps per sample are few: more would move a parameter by {0.15 * whole:.2g} sd"
             return replace(solved, problem=replace(problem, remarks=(*problem.remarks, said))), precision
-        stride, refined = min(_FINEST, stride * 2 ** math.ceil(math.log2(excess) / 2)), True
-        plan.progress(f"{stride} steps per sample")
+        # In twice as many, or as the error asks for, where a run has its part in it.
+        share = np.maximum(each * len(runs), 1.0)
+        more = [2 ** math.ceil(math.log2(own) / 2) for own in share]
+        strides, refined = [min(_FINEST, stride * factor) for stride, factor in zip(strides, more, strict=True)], True
+        plan.progress(f"{' and '.join(map(str, strides))} steps per sample")
         problem = solved.onward
