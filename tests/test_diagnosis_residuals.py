@@ -213,7 +213,9 @@ def test_faults_have_the_variance_that_they_make(rng):
     # At an even speed a period in the position is a line in time.
     assert name_faults(faults(band=wave), True) == []
     # A mode that rings after steps is a line in time, too.
-    assert name_faults(faults(band=wave), False, bursts=True) == []
+    assert name_faults(faults(band=wave), False, mistaken=True) == []
+    own = [faults(band=wave).rings_itself(at_Hz) for at_Hz in (None, 13.0, 15.0, 25.0, 27.0)]
+    assert own == [False, False, True, True, False]
     for other in (replace(wave, frequency_Hz=50.0), replace(wave, quality=1.0), replace(wave, z=3.0)):
         assert name_faults(faults(band=other), False) == []
 

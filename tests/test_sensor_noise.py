@@ -84,3 +84,12 @@ def test_hum_is_no_part_of_the_floor(rng):
         found = floor_in(voltage, left, rate).noise
         assert found.total_um == pytest.approx(0.05, rel=0.2)
     assert floor_in(voltage, noise).noise.total_um == pytest.approx(0.05, rel=0.15)
+
+
+def test_readings_that_keep_to_one_digit_are_no_outliers(rng):
+    """What changes from sample to sample is next to nothing there, which once left no sample of an idle command."""
+    voltage = np.zeros(400)
+    residual = np.repeat(rng.choice([-1.0, 1.0], 20), 20) + 1e-9 * rng.standard_normal(400)
+    floor = floor_of(voltage, residual, np.ones(400, dtype=bool), 1e3, 0.0, 1e-9, 3.0, 0.05)
+    assert floor.idle > 0
+    assert 0.3 < floor.noise.total_um < 3.0

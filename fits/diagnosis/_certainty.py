@@ -11,7 +11,7 @@ from fits.diagnosis._baseline import Baseline, with_effects
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._extension import shared_effects
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, changes_along
+from fits.diagnosis._refit import STEP, Refit
 from fits.diagnosis._result import FoundCause
 from fits.loop._prior import definite
 from fits.loop._result import ParameterEstimate
@@ -35,7 +35,7 @@ class Certainty:
 
     def __init__(self, projector: Projector, model: Refit, bench: Bench, baseline: Baseline):
         self.projector, self.model, self.baseline = projector, model, baseline
-        both = zip(projector.regression.rows, changes_along(bench, model), strict=True)
+        both = zip(projector.regression.rows, _changes_along(bench, model), strict=True)
         self.rows = [np.concatenate(pair, axis=1) for pair in both]
 
     def parameters(self, causes: Sequence[FoundCause] = ()) -> tuple[ParameterEstimate, ...]:
@@ -117,3 +117,16 @@ class Certainty:
         out = [(coordinates(step) - coordinates(-step)) / (2 * _STEP) for step in _STEP * np.eye(int(stops[-1]))]
         # A strength at its bound stays there.
         return np.nan_to_num(np.stack(out, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _changes_along(bench: Bench, model: Refit) -> list[np.ndarray]:
+    """Derivatives of what effects change along all their coordinates, per run, in um, shape `(n, k)`."""
+    counts = [law.size for law in model.laws]
+    out = [np.empty((len(um), sum(counts))) for um in model.change_um]
+    for k, step in enumerate(STEP * np.eye(sum(counts))):
+        moves = zip(model.x, np.split(step, np.cumsum(counts)[:-1]), strict=True)
+        there = replace(model, x=tuple(x + move for x, move in moves))
+        for run, columns in enumerate(out):
+            moved = bench.respond_in(run, there.effects(run)) - bench.plain[run]
+            columns[:, k] = (moved - model.change_um[run]) / STEP
+    return out

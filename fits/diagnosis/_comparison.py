@@ -72,11 +72,13 @@ def compare_rivals(
     better.
     """
     before, first = projector.held_out(model.change_um), len(model.laws)
-    fits = list[tuple[Scored, Refit]]()
+    fits, least = list[tuple[Scored, Refit]](), np.inf
     for one in leaders(scores, bench.baseline.dynamic):
         if not fits or has_time():
-            fits.append((one, refit_beside(bench, projector, model, one)))
-    least = min(found.cost for _, found in fits)
+            # What ends far behind the best so far need not be known exactly.
+            enough = least + _NEAR * max(model.cost - least, 0.0)
+            fits.append((one, refit_beside(bench, projector, model, one, enough)))
+            least = min(least, fits[-1][1].cost)
     chance_z = thresholds.chance_z
     noise = [found for _, found in fits if found.is_noise(projector, chance_z)]
     # What ended at its bound is taken only where nothing else explains as much.

@@ -123,7 +123,8 @@ def conclude(
     )
     unlike, in_bursts = irregular(told.first, told.plain.residual, thresholds)
     bursts = in_bursts and not kept and not rounded
-    named = name_faults(faults, cyclic, bursts, thresholds)
+    rings = faults.is_narrow(thresholds) and faults.rings_itself(baseline.resonance_Hz)
+    named = name_faults(faults, cyclic, bursts or rings, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults, has_time)
     if kept and not has_time():
@@ -165,6 +166,12 @@ def conclude(
     )
     if bursts:
         remarks.append("what is left comes in bursts that no effect of the library makes")
+    elif rings:
+        remarks.append(
+            f"what is left rings near {faults.band.frequency_Hz:.4g} Hz, where the stage itself does after all that "
+            "its model lacks: a vibration of the floor there cannot be told from that"
+        )
+    if bursts or rings:
         left_over = True
         excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)

@@ -17,6 +17,8 @@ from microid.effects import Statistic
 
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
+# Widths of a narrow band within which it is where the stage rings by itself.
+_OWN_WIDTHS = 3.0
 # Part of a spike off what the stage would leave, if it moved, that is in what it leaves.
 _SEEN = 0.5
 
@@ -49,6 +51,12 @@ class Faults:
     def is_narrow(self, thresholds: Thresholds) -> bool:
         """Whether there is a narrow band beyond chance that is no hum."""
         return self.band.z > thresholds.strong_z and self.band.narrow and not self.band.mains
+
+    def rings_itself(self, resonance_Hz: float | None) -> bool:
+        """Whether the narrow band is where the stage rings, as it does after all that a model lacks."""
+        if resonance_Hz is None:
+            return False
+        return abs(self.band.frequency_Hz - resonance_Hz) < _OWN_WIDTHS * self.band.frequency_Hz / self.band.quality
 
     def clean(self, records: Sequence[Record]) -> list[Record]:
         """Take the spikes out of records."""
@@ -163,12 +171,12 @@ class Fault:
 
 
 def name_faults(
-    faults: Faults, cyclic: bool, bursts: bool = False, thresholds: Thresholds = THRESHOLDS
+    faults: Faults, cyclic: bool, mistaken: bool = False, thresholds: Thresholds = THRESHOLDS
 ) -> list[Fault]:
     """Which of them explain enough of what is left.
 
     What repeats itself with the position (`cyclic`) is no jitter, and at an even speed it looks like a narrow band.
-    What comes in `bursts` does, too, where a resonance rings; a floor shakes all the time.
+    A band may be `mistaken`: the stage rings in bursts, or at its resonance, and a floor shakes all the time.
     """
     found = []
     total = float(np.mean([n.total_um**2 for n in faults.noise]))
@@ -188,7 +196,7 @@ def name_faults(
         jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
-    narrow = faults.is_narrow(thresholds) and not cyclic and not bursts
+    narrow = faults.is_narrow(thresholds) and not cyclic and not mistaken
     # Up to its own size rounding makes lines, too, where a motion is even.
     if narrow and band.size_um**2 > max(thresholds.minor_share / 3 * total, step**2 / 12):
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"

@@ -134,7 +134,7 @@ class Predictor:
         baseline = self.bench.baseline
         record = next_record(time_s, voltage_V, self.bench.prepared[self._like].run.record)
         # With steps between the samples that are too long, a lag and a delay differ by what both are off.
-        stride = baseline.fine[self._like].samples.stride
+        stride = baseline.fine[self._like].coarser.stride
         run = prepare_run(record, baseline.range_V, "unknown", 0.0, stride, hold=baseline.stage.hold)
         alone = baseline.alone(run)
         bench, noise = Bench(alone), self._noise(float(time_s[1] - time_s[0]))

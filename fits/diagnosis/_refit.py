@@ -16,11 +16,13 @@ from fits.io.columns.temperature import TEMPERATURE
 from fits.stats._score_test import BLOCK
 from microid.effects import AbstractEffect
 
-_STEP = 1e-3
+STEP = 1e-3
 # Standard deviations up to which a strength may be larger than it was found.
 _LARGEST_Z = 3.0
 # Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
 _ROUNDS, _FARTHEST, _LEAST_GAIN = 12, 3.0, 0.1
+# Last rounds of which the best says what others may gain.
+_LAST = 3
 # Factor by which that is shortened where it was too far.
 _SHORTER = 4.0
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
@@ -163,22 +165,9 @@ def _strength(
     law: Law, x: np.ndarray, run: int, varied: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Strengths of an effect in a run, and their standard deviations by the covariance of the varied coordinates."""
-    here, moves = strength_of(law, x, run), _STEP * np.eye(law.size)[varied]
-    slope = np.stack([(strength_of(law, x + move, run) - here) / _STEP for move in moves], axis=1)
+    here, moves = strength_of(law, x, run), STEP * np.eye(law.size)[varied]
+    slope = np.stack([(strength_of(law, x + move, run) - here) / STEP for move in moves], axis=1)
     return here, np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0))
-
-
-def changes_along(bench: Bench, model: Refit) -> list[np.ndarray]:
-    """Derivatives of what effects change along all their coordinates, per run, in um, shape `(n, k)`."""
-    counts = [law.size for law in model.laws]
-    out = [np.empty((len(um), sum(counts))) for um in model.change_um]
-    for k, step in enumerate(_STEP * np.eye(sum(counts))):
-        moves = zip(model.x, np.split(step, np.cumsum(counts)[:-1]), strict=True)
-        there = replace(model, x=tuple(x + move for x, move in moves))
-        for run, columns in enumerate(out):
-            moved = bench.respond_in(run, there.effects(run)) - bench.plain[run]
-            columns[:, k] = (moved - model.change_um[run]) / _STEP
-    return out
 
 
 def nothing(bench: Bench, projector: Projector) -> Refit:
@@ -195,16 +184,18 @@ def refit(
     return _fit(bench, projector, laws, x, 0, np.zeros((len(projector.residual), 0)), rounds)
 
 
-def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Scored) -> Refit:
+def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Scored, enough: float = np.inf) -> Refit:
     """Fit one more effect, those that are there following along their tangent.
 
     It starts from the multiple of the linearised answer that explains most: effects saturate as they grow, and from
-    too weak a start a fit ends in another minimum.
+    too weak a start a fit ends in another minimum. It is given up where it does not come to a sum of squares that is
+    `enough`.
     """
     basis, runs = model.basis(), len(bench.prepared)
 
     def fit(law: Law, rounds: int) -> Refit:
-        return _fit(bench, projector, [*model.laws, law], [*model.x, law.start], len(model.laws), basis, rounds)
+        laws, x = [*model.laws, law], [*model.x, law.start]
+        return _fit(bench, projector, laws, x, len(model.laws), basis, rounds, enough)
 
     laws = [law_of(scored, runs, more) for more in (_MULTIPLES if scored.form.strength else (1.0,))]
     found = fit(min(laws, key=lambda law: fit(law, 0).cost), _ROUNDS)
@@ -276,8 +267,12 @@ def _fit(
     held: int,
     basis: np.ndarray,
     rounds: int,
+    enough: float = np.inf,
 ) -> Refit:
-    """Fit all laws but the first so many, which follow along `basis`."""
+    """Fit all laws but the first so many, which follow along `basis`.
+
+    Rounds that are left are not taken where none of them would be `enough`, gaining as much as one of the last.
+    """
     runs = len(bench.prepared)
     moving = laws[held:]
     target = projector.off(projector.residual)
@@ -308,10 +303,10 @@ def _fit(
     def slope() -> np.ndarray:
         at, raw = projector.join(at_um), np.empty((len(target), len(flat)))
         moves = [(run, k) for k in range(len(flat)) for run in range(runs) if counts[run][k]]
-        steps = flat + _STEP * np.eye(len(flat))
+        steps = flat + STEP * np.eye(len(flat))
         found = dict(zip(moves, map_in_threads(lambda move: change_in(move[0], steps[move[1]]), moves), strict=True))
         for k in range(len(flat)):
-            raw[:, k] = (projector.join([found.get((run, k), um) for run, um in enumerate(at_um)]) - at) / _STEP
+            raw[:, k] = (projector.join([found.get((run, k), um) for run, um in enumerate(at_um)]) - at) / STEP
         raw = np.where(np.isfinite(raw), raw, 0.0)
         seen = -off(raw)
         return np.where(np.linalg.norm(seen, axis=0) > _ROUNDING_SHARE * np.linalg.norm(raw, axis=0), seen, 0.0)
@@ -323,7 +318,8 @@ def _fit(
     jacobian = slope() if rounds else np.zeros((len(residual), len(flat)))
     damping, farthest = 1e-3, _FARTHEST
     turning = np.concatenate([law.turning for law in moving])
-    for _ in range(rounds):
+    gains = list[float]()
+    for number in range(rounds):
         cost = float(residual @ residual)
         scale = np.linalg.norm(jacobian, axis=0) + 1e-300
         gram, cross = (jacobian / scale).T @ (jacobian / scale), (jacobian / scale).T @ residual
@@ -341,7 +337,10 @@ def _fit(
                 break
             damping *= 10
             farthest = min(farthest, float(np.max(np.abs(step)))) / _SHORTER
-        if not moved or cost - float(residual @ residual) < _LEAST_GAIN:
+        left_over = float(residual @ residual)
+        gains.append(cost - left_over)
+        hopeless = left_over - max(gains[-_LAST:]) * (rounds - 1 - number) > enough
+        if not moved or gains[-1] < _LEAST_GAIN or hopeless:
             break
         jacobian = slope()
     found = tuple(laws), (*x[:held], *parts(flat)), tuple(at_um)

@@ -1,6 +1,6 @@
 """Which effects the records need: a search over sets of causes, with refits, and a backward check."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +55,7 @@ def select(
     while beam:
         grown: dict[frozenset[str], tuple[int, Explanation]] = {}
         for one in beam:
-            more = sorted(_grown(one, search), key=lambda one: one.criterion)
+            more = sorted(_grown(one, search, grown), key=lambda one: one.criterion)
             if one.causes:
                 one.projector.release()
             if not more:
@@ -84,8 +84,11 @@ def select(
     return _refined(with_equals(best, ends, thresholds, plain), start, search)
 
 
-def _grown(one: Explanation, search: Search) -> list[Explanation]:
-    """The same with one more cause: with each of those that explain about as much."""
+def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) -> list[Explanation]:
+    """The same with one more cause: with each of those that explain about as much.
+
+    None where what explains most leads to a set of causes that is `known`, as in another order.
+    """
     thresholds, false_alarm = search.thresholds, search.false_alarm
     bench, projector, model = one.bench, one.projector, one.model
     taken, refused = set(one.names), set[str]()
@@ -106,9 +109,12 @@ def _grown(one: Explanation, search: Search) -> list[Explanation]:
     for _ in range(_TRIES if room else 0):
         closed = (taken & _ONCE) | refused
         open_ = [s for s in one.left if s.name not in closed and s.z > bars[s.form]]
-        top = max((s.z for s in open_), default=0.0)
-        if not open_ or one.family.p(top / sigma) >= false_alarm or not search.has_time():
+        best = max(open_, key=lambda s: s.z, default=None)
+        if best is None or one.family.p(best.z / sigma) >= false_alarm or not search.has_time():
             break
+        if frozenset((*taken, best.name)) in known:
+            break
+        top = best.z
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         if bench.baseline.dynamic:
             # A lag that the poles have taken over shows nothing here, but its fit begins elsewhere.

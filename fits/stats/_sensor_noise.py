@@ -64,8 +64,9 @@ def floor_of(
     if sum(len(piece) for piece in pieces) >= _IDLE:
         pieces = _without_mains(pieces, 1 / rate_Hz, 1 - hum_share)
         joined = np.concatenate(pieces)
-        if (rough_um := rough_noise_um(joined)) > 0:
-            joined = joined[np.abs(joined) < 8 * rough_um + 1e-300]
+        usual = np.abs(joined) < 8 * rough_noise_um(joined)
+        # Readings that keep to one digit for long have no rough noise, and most of them are no outliers.
+        joined = joined[usual] if usual.sum() > len(usual) / 2 else joined
         freedom = 4.0 * len(pieces)
         level = float(np.std(joined)) * (len(joined) / max(len(joined) - freedom, 1)) ** 0.5
         correlation = float(np.mean(joined[1:] * joined[:-1]) / max(np.mean(joined**2), 1e-300))
