@@ -53,9 +53,10 @@ class Stage(eqx.Module):
 
     Neighbouring linear parts are solved together, exactly for the hold of the command. A hysteresis sees the voltage
     at the samples only, exactly so far as no extreme falls between two of them. What follows it sees its output
-    joined smoothly if an inertia comes before, and by lines otherwise and under a command in steps: an error that
-    falls with the fourth power of the interval (the third where a command in lines turns), or the square, and that
-    `substeps` makes smaller.
+    joined smoothly if an inertia comes before, and by lines otherwise: an error that falls with the fourth power of
+    the interval (the third where a command in lines turns), or the square, and that `substeps` makes smaller. Behind
+    a driver whose command is in steps the output settles within each interval as the driver does, which is off by the
+    curvature of the hysteresis alone.
 
     Attributes
     ----------

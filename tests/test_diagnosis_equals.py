@@ -4,10 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_diagnosis_comparison import asked, made
 
 from fits.diagnosis import _explanation, _select
 from fits.diagnosis._conclude import verdict_of
 from fits.diagnosis._explanation import Cause, Explanation, best_of_ends, with_equals
+from fits.diagnosis._refit import nothing, refit_beside
+from fits.diagnosis._score import score
 from fits.diagnosis._thresholds import THRESHOLDS
 from microid.effects import EFFECTS
 
@@ -57,6 +60,21 @@ def test_what_explains_less_in_the_end_is_none(monkeypatch):
     assert found.causes[0].rivals == ()
 
 
+def test_a_fit_that_cannot_come_near_enough_is_left(rng, monkeypatch):
+    case = made(rng, lambda bench, _: [um + 0.02 * np.tanh(3 * (um - um.mean()) / np.ptp(um)) for um in bench.plain])
+    plain = nothing(case.bench, case.projector)
+    best = max(score(case.projector, asked(case, "creep"), plain.residual).each, key=lambda one: one.z)
+    costs, calls, respond = [], [], case.bench.respond_in
+    monkeypatch.setattr(case.bench, "respond_in", lambda *each: calls.append(each) or respond(*each))
+    for enough in (np.inf, plain.cost, 0.0):
+        calls.append(None)
+        costs.append((refit_beside(case.bench, case.projector, plain, best, enough).cost, len(calls)))
+        calls.clear()
+    (whole, many), (same, as_many), (_, few) = costs
+    assert (same, as_many) == (whole, many)
+    assert few < many
+
+
 @pytest.mark.parametrize(("grown", "followed"), [(1.3, []), (0.9, ["creep", "backlash"])])
 def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown, followed):
     # Nor is what explains less than that in its place.
@@ -88,8 +106,11 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
         has_time=lambda: True,
         progress=print,
     )
-    found = _select._grown(one, search)
+    found = _select._grown(one, search, ())
     assert (found[0] if found else []) == followed
+    assert asked == ["backlash"]
+    # The same two were reached in the other order.
+    assert _select._grown(one, search, {frozenset(("backlash", "creep"))}) == []
     assert asked == ["backlash"]
 
 
