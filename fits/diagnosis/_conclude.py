@@ -85,8 +85,8 @@ def conclude(
     # Of what one run had of its own other runs show nothing.
     repeats = not any(map(is_own, extension.effects))
     seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
-    # Both need the support of what was held out.
-    most_z = -thresholds.worse_z / 2 if weak or small else thresholds.worse_z
+    # Both need the support of what was held out, and what is both needs more of it.
+    most_z = thresholds.worse_z if not (weak or small) else -thresholds.worse_z / (1 if weak and small else 2)
     worse = predicts_worse(seen, most_z, thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
         why = f"what was held out is predicted {'no better' if weak or small else 'worse'} with that"

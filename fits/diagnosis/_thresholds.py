@@ -26,7 +26,8 @@ class Thresholds:
         Standard deviations by which a sum of squares exceeds its mean by chance.
     worse_z
         Standard deviations by which an extension may predict held-out data worse, and by which one that hardly stands
-        out of the rest of the misfit must predict them better; half as many if it is weak or small beside the noise.
+        out of the rest of the misfit, or is weak and small beside the noise, must predict them better; half as many
+        where it is one of these.
     worse_share
         Part of their mean square by which errors in held-out data may grow with an extension: what the data held out
         do not show changes by less than that, by chance.

@@ -312,19 +312,23 @@ def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
         if not inside and (plan.gain is None or refined):
             return solved, precision
         moved, halved = np.zeros((len(runs), len(solved.z))), plan.runs([2 * stride for stride in strides])
+        shown = np.zeros(len(runs))
         for k, (own, run, finer) in enumerate(zip(precision.influence, runs, halved, strict=True)):
             off = simulate_stage(solved.stage, run) - simulate_stage(solved.stage, finer)
-            moved[k] = own @ (off - off[run.fitted].mean())
+            off -= off[run.fitted].mean()
+            moved[k], shown[k] = own @ off, np.std(off[run.fitted]) / solved.weighing.noise_um[k]
         # Halving the step takes three quarters of its error off, which falls with its square; the steps of all runs
-        # together may move a parameter by 0.15 standard deviations.
+        # together may move a parameter by 0.15 standard deviations, and those of each its response by 0.02.
         whole, each = (np.max(np.abs(m) / precision.sd, -1) / (0.75 * 0.15) for m in (moved.sum(axis=0), moved))
-        if whole <= 1:
+        shown /= 0.75 * 0.02
+        if max(whole, *shown) <= 1:
             return solved, precision
         if max(strides) == _FINEST:
             said = f"{_FINEST} steps per sample are few: more would move a parameter by {0.15 * whole:.2g} sd"
-            return replace(solved, problem=replace(problem, remarks=(*problem.remarks, said))), precision
+            remarks = (*problem.remarks, said) if whole > 1 else problem.remarks
+            return replace(solved, problem=replace(problem, remarks=remarks)), precision
         # In twice as many, or as the error asks for, where a run has its part in it.
-        share = np.maximum(each * len(runs), 1.0)
+        share = np.maximum(np.maximum(each * len(runs), shown), 1.0)
         more = [2 ** math.ceil(math.log2(own) / 2) for own in share]
         strides, refined = [min(_FINEST, stride * factor) for stride, factor in zip(strides, more, strict=True)], True
         plan.progress(f"{' and '.join(map(str, strides))} steps per sample")
