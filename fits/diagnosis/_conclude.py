@@ -82,9 +82,9 @@ def conclude(
     weak = max((cause.z for cause in kept), default=0.0) < thresholds.strong_z
     # What is small beside the noise may be an error of the plain stage that is too small to show.
     small = misfit.explained < thresholds.rest_noise**2 * misfit.count
-    # Of what one run had of its own other runs show nothing.
+    # Of what one run had of its own other runs show nothing, unless it is so little that it may be what they lack.
     repeats = not any(map(is_own, extension.effects))
-    seen = extension.compared if repeats else extension.compared[: len(baseline.runs)]
+    seen = extension.compared if repeats or (weak and small) else extension.compared[: len(baseline.runs)]
     # Both need the support of what was held out, and what is both needs more of it.
     most_z = thresholds.worse_z if not (weak or small) else -thresholds.worse_z / (1 if weak and small else 2)
     worse = predicts_worse(seen, most_z, thresholds.worse_share)
