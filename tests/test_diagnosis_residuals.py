@@ -26,6 +26,7 @@ from fits.diagnosis._residual_tests import (
     repeats_in,
     run_regressors,
 )
+from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._band import Band
 from fits.stats._noise import Noise
 
@@ -214,7 +215,8 @@ def test_faults_have_the_variance_that_they_make(rng):
     assert name_faults(faults(band=wave), True) == []
     # A mode that rings after steps is a line in time, too.
     assert name_faults(faults(band=wave), False, mistaken=True) == []
-    own = [faults(band=wave).rings_itself(at_Hz) for at_Hz in (None, 13.0, 15.0, 25.0, 27.0)]
+    # Within four widths, which are of 2 Hz.
+    own = [faults(band=wave).rings_itself(at_Hz, THRESHOLDS) for at_Hz in (None, 11.0, 13.0, 27.0, 29.0)]
     assert own == [False, False, True, True, False]
     for other in (replace(wave, frequency_Hz=50.0), replace(wave, quality=1.0), replace(wave, z=3.0)):
         assert name_faults(faults(band=other), False) == []

@@ -161,12 +161,11 @@ def fit_baseline(
         return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
     solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
     prior = prior_precision(chain, solved.hyper, stroke_um)
-
     strides = [run.stride for run in solved.runs]
 
     def prepared(least: int, most: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-        many = [int(np.clip(stride, least, most)) for stride in (*strides, *[max(strides)] * len(aside))]
-        held = _prepared(aside, range_V, initial, 0.0, many[len(strides) :], past, held_holds)
+        many = [int(np.clip(stride, least, most)) for stride in strides]
+        held = _prepared(aside, range_V, initial, 0.0, [max(many)] * len(aside), past, held_holds)
         return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
     asked = _prepared(aside, range_V, initial, 0.0, [_FINE] * len(aside), False)
@@ -225,7 +224,7 @@ def _prepared(
     holds: Sequence[Hold] = (),
 ) -> tuple[Run, ...]:
     lines: list[Hold] = ["first"] * len(records)
-    each = zip(records, strides, holds or lines, strict=False)
+    each = zip(records, strides, holds or lines, strict=True)
     settings = range_V, initial, holdout
     return tuple(prepare_run(one, *settings, stride, hold=hold, estimated=estimated) for one, stride, hold in each)
 

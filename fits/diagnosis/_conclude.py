@@ -86,7 +86,7 @@ def conclude(
     repeats = not any(map(is_own, extension.effects))
     seen = extension.compared if repeats or (weak and small) else extension.compared[: len(baseline.runs)]
     # Both need the support of what was held out, and what is both needs more of it.
-    most_z = thresholds.worse_z if not (weak or small) else -thresholds.worse_z / (1 if weak and small else 2)
+    most_z = thresholds.worse_z * (1.0, -0.5, -1.0)[weak + small]
     worse = predicts_worse(seen, most_z, thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
         why = f"what was held out is predicted {'no better' if weak or small else 'worse'} with that"
@@ -123,7 +123,7 @@ def conclude(
     )
     unlike, in_bursts = irregular(told.first, told.plain.residual, thresholds)
     bursts = in_bursts and not kept and not rounded
-    rings = faults.is_narrow(thresholds) and faults.rings_itself(baseline.resonance_Hz)
+    rings = faults.is_narrow(thresholds) and faults.rings_itself(baseline.resonance_Hz, thresholds)
     named = name_faults(faults, cyclic, bursts or rings, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * noise_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults, has_time)

@@ -17,8 +17,6 @@ from microid.effects import Statistic
 
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
-# Widths of a narrow band within which it is where the stage rings by itself.
-_OWN_WIDTHS = 3.0
 # Part of a spike off what the stage would leave, if it moved, that is in what it leaves.
 _SEEN = 0.5
 
@@ -52,11 +50,12 @@ class Faults:
         """Whether there is a narrow band beyond chance that is no hum."""
         return self.band.z > thresholds.strong_z and self.band.narrow and not self.band.mains
 
-    def rings_itself(self, resonance_Hz: float | None) -> bool:
-        """Whether the narrow band is where the stage rings, as it does after all that a model lacks."""
+    def rings_itself(self, resonance_Hz: float | None, thresholds: Thresholds) -> bool:
+        """Whether the band is at the stage's resonance, which rings after all that a model lacks."""
         if resonance_Hz is None:
             return False
-        return abs(self.band.frequency_Hz - resonance_Hz) < _OWN_WIDTHS * self.band.frequency_Hz / self.band.quality
+        width_Hz = self.band.frequency_Hz / self.band.quality
+        return abs(self.band.frequency_Hz - resonance_Hz) < thresholds.apart_z * width_Hz
 
     def clean(self, records: Sequence[Record]) -> list[Record]:
         """Take the spikes out of records."""
