@@ -86,7 +86,7 @@ def conclude(
     repeats = not any(map(is_own, extension.effects))
     seen = extension.compared if repeats or (weak and small) else extension.compared[: len(baseline.runs)]
     # Both need the support of what was held out, and what is both needs more of it.
-    most_z = thresholds.worse_z * (1.0, -0.5, -1.0)[weak + small]
+    most_z = thresholds.worse_z * (1.0, -0.5, -1.0)[int(weak) + int(small)]
     worse = predicts_worse(seen, most_z, thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
         why = f"what was held out is predicted {'no better' if weak or small else 'worse'} with that"
