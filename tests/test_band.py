@@ -1,10 +1,14 @@
 """A narrow band of a residual, whatever its size and shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from fits.stats._band import band_of
+from fits.diagnosis._noise import _one_floor
+from fits.diagnosis._thresholds import THRESHOLDS
+from fits.stats._band import Band, band_of
 
 # Residuals over a time, some with white noise of standard deviation one.
 ODD = {
@@ -55,3 +59,26 @@ def test_what_comes_back_with_the_voltage_is_no_vibration(rng):
     assert band_of(kinks_um + noise_um, 1 / 2500, place_V).z < 8
     shaking_um = 0.02 * np.sin(2 * np.pi * 45 * time_s + np.cumsum(0.02 * rng.standard_normal(len(time_s))))
     assert band_of(shaking_um + noise_um, 1 / 2500, place_V).z > 8
+
+
+def test_a_slow_floor_is_told_from_loops_that_are_as_long_as_it_remembers(rng):
+    """A band of 9 Hz forgets its phase within 4 s: passes of a loop 1.25 s apart agree by chance."""
+    n, rate_Hz = 3400, 100.0
+    radius = np.exp(-np.pi * 9 / 38 / rate_Hz)
+    past = [1.0, -2 * radius * np.cos(2 * np.pi * 9 / rate_Hz), radius**2]
+    loops_V = 50 - 50 * np.cos(2 * np.pi * np.arange(n) / rate_Hz / 1.25)
+    agreed = 0
+    for _ in range(10):
+        wave = lfilter([1.0], past, rng.standard_normal(n + 5000))[5000:]
+        found = band_of(wave / np.std(wave) + 0.2 * rng.standard_normal(n), 1 / rate_Hz, loops_V)
+        agreed += found.z > 8 and not found.mains and found.frequency_Hz == pytest.approx(9, rel=0.05)
+    assert agreed >= 8
+
+
+def test_what_a_run_may_play_is_the_floor_where_another_run_shows_it():
+    seen = Band(33.0, 0.04, 0.004, 16.0, 15.0, 2000.0, 3, played=True)
+    other = Band(32.4, 0.03, 0.004, 13.0, 6.0, 4000.0)
+    assert not _one_floor([seen, other], THRESHOLDS).played
+    for elsewhere in (replace(other, frequency_Hz=70.0), replace(other, z=2.0)):
+        assert seen not in (_one_floor([seen, elsewhere], THRESHOLDS), _one_floor([elsewhere, seen], THRESHOLDS))
+    assert _one_floor([seen], THRESHOLDS).played

@@ -48,7 +48,8 @@ class Faults:
 
     def is_narrow(self, thresholds: Thresholds) -> bool:
         """Whether there is a narrow band beyond chance that is no hum."""
-        return self.band.z > thresholds.strong_z and self.band.narrow and not self.band.mains
+        band = self.band
+        return band.z > thresholds.strong_z and band.narrow and not band.mains and not band.played
 
     def rings_itself(self, resonance_Hz: float | None, thresholds: Thresholds) -> bool:
         """Whether the band is at the stage's resonance, which rings after all that a model lacks."""
@@ -123,8 +124,7 @@ def find_faults(
             replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
             for n, (_, _, rate, _) in zip(noise, jitters, strict=True)
         ]
-    # What may be hum in one run may be told from it in another.
-    band = max(bands, key=lambda one: (not one.mains, one.z))
+    band = _one_floor(bands, thresholds)
     source = "idle stretches where there are any, and the fastest changes of the residual elsewhere"
     if all(floor.idle for floor in floors):
         source = "idle stretches of the runs"
@@ -137,6 +137,18 @@ def find_faults(
     size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
+
+
+def _one_floor(bands: list[Band], thresholds: Thresholds) -> Band:
+    """The strongest band that may be the floor's, which shakes all runs.
+
+    What may be hum, or played, in one run may be told from that in another.
+    """
+    seen = []
+    for k, one in enumerate(bands):
+        others = [b for j, b in enumerate(bands) if j != k and not b.played and b.z > thresholds.determined_z]
+        seen.append(replace(one, played=one.played and not any(one.agrees(other) for other in others)))
+    return max(seen, key=lambda one: (not one.mains and not one.played, one.z))
 
 
 def _between(values: np.ndarray, bad: np.ndarray) -> np.ndarray:

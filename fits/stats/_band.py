@@ -34,7 +34,10 @@ _QUALITIES, _HEIGHTS = tuple(2.0**k for k in range(9)), tuple(4.0**k for k in ra
 
 @dataclass(frozen=True)
 class Band:
-    """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, evidence, and bins."""
+    """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, evidence, and bins.
+
+    A band is `played` if it is as narrow as a line and at a multiple of one of the command's.
+    """
 
     frequency_Hz: float
     size_um: float
@@ -43,6 +46,7 @@ class Band:
     z: float
     rate_Hz: float = 0.0
     bins: int = 1
+    played: bool = False
 
     @property
     def narrow(self) -> bool:
@@ -52,7 +56,7 @@ class Band:
     @property
     def mains(self) -> bool:
         """Whether it is near a line of mains, or near what sampling makes of one, or is nothing at all."""
-        rate, own = self.rate_Hz, DRIFT * 4
+        rate, own = self.rate_Hz, DRIFT * 2
         if self.bins >= 16:  # no line has so many
             return False
         return rate == 0 or any(
@@ -62,9 +66,14 @@ class Band:
             for k in range(1, 5)
         )
 
+    def agrees(self, other: "Band") -> bool:
+        """Whether another is within the half of their widths."""
+        halves_Hz = (one.frequency_Hz / max(one.quality, 1.0) / 2 for one in (self, other))
+        return abs(self.frequency_Hz - other.frequency_Hz) < sum(halves_Hz)
+
 
 def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -> Band:
-    """Find a narrow band between 2 and 200 Hz that goes on throughout and does not come of what the command plays.
+    """Find a narrow band between 2 and 200 Hz that goes on throughout, and say whether the command may play it.
 
     Residual and command are evenly sampled, shape `(n,)`. Where the samples show too few frequencies of that range,
     nothing is found, with an evidence of 0.
@@ -94,8 +103,9 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     middle_Hz, quality = float(np.exp(middle)), float(np.exp(quality))
     best, width_Hz = round(middle_Hz / bin_Hz), middle_Hz / quality
     bins = max(round(width_Hz / bin_Hz), 1)
-    if not lowest_Hz < middle_Hz < highest_Hz or (bins <= _LINE and _played(_power(command_V), best)):
+    if not lowest_Hz < middle_Hz < highest_Hz:
         return none
+    played = bins <= _LINE and _played(_power(command_V), best)
     # It goes on throughout: no block has nearly all of it.
     swing = np.exp(-2j * np.pi * middle_Hz * interval_s * np.arange(n)) * (residual - residual.mean())
     blocks = np.array([np.abs(block.sum()) ** 2 for block in np.array_split(swing, 8)])
@@ -105,22 +115,24 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
         return none
     # The area of the peak, whose bins stand for two each.
     square = float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n)
-    if _comes_back(residual, command_V, 1 / (middle_Hz * interval_s)) > _SHARE * square:
+    # Noise of this width forgets its phase within as many cycles as its quality, of which a record may have few.
+    forgets = min(max(quality, 1.0) / (middle_Hz * interval_s), n / 3)
+    if _comes_back(residual, command_V, forgets) > _SHARE * square:
         return none
     size_um = scale_um * square**0.5
     # Noise of this width has so many independent values.
     sd_um = size_um / (2 * max(width_Hz * n * interval_s, 1.0) ** 0.5)
     z = max(2 * (found - nothing - np.log(inside.sum())), 0.0) ** 0.5
-    return Band(middle_Hz, size_um, sd_um, quality, float(z), 1 / interval_s, bins)
+    return Band(middle_Hz, size_um, sd_um, quality, float(z), 1 / interval_s, bins, played)
 
 
-def _comes_back(residual: FloatArray, command_V: FloatArray, period: float) -> float:
+def _comes_back(residual: FloatArray, command_V: FloatArray, apart: float) -> float:
     """Variance of what is the same wherever the command goes up, or down, through the same voltage again.
 
-    Instants are compared that are so many samples apart, a period of the band, or more.
+    Instants are compared that are so many samples apart, or more.
     """
     falling = np.gradient(command_V) < 0
-    return repeated_square(command_V + 2 * np.ptp(command_V) * falling, residual, period / 5)
+    return repeated_square(command_V + 2 * np.ptp(command_V) * falling, residual, apart / 5)
 
 
 def _power(values: FloatArray) -> FloatArray:
