@@ -33,5 +33,6 @@ def test_one_branch_shows_no_effect_that_a_density_does_not():
     # Up from an unknown past and down again: any function of the voltage is a density there.
     record = fits.read_csv(measured("afm_z_piezo_5um.csv"))
     found = fits.diagnose([record])
-    assert found.verdict == "unexplained"
+    # A hum of 0.7 nm goes with the time, not with the voltage: that may be there.
+    assert {cause.name for cause in found.causes} <= {"mains_hum"}
     assert found.unexplained_rms_um < 0.001 * np.ptp(record.displacement_um)
