@@ -35,6 +35,8 @@ from microid.effects import EFFECTS
 _EVEN = 1.0
 # How many times what a start leaves, on average, is too much beside one that has a lag of the reading, too.
 _BAD = 3.0
+# Part of the sampling interval below which a driver's time constant hardly shows behind steps.
+_SETTLED = 0.2
 # Steps per sample that a fit takes at most.
 _FINEST = 16
 
@@ -301,9 +303,18 @@ def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
     return commands if law is None else [np.asarray(law(jnp.asarray(voltage))) for voltage in commands]
 
 
+def _visible(plan: Plan, problem: Problem) -> Problem:
+    """The same from drivers that samples show: no derivative leads back to one that settles between held commands."""
+    stage = problem.chain.stage(jnp.asarray(problem.z), jnp.asarray(problem.columns_um))
+    for name, driver in named_parts(stage, Driver) if "zero" in plan.holds else ():
+        tau_s = jnp.maximum(driver.time_constant_s, _SETTLED * plan.interval_s)
+        stage = stage.swap(name, replace(driver, time_constant_s=tau_s))
+    return replace(problem, z=np.asarray(problem.chain.coordinates.of(stage)))
+
+
 def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
     """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
-    strides, refined = [1] * len(plan.records), False
+    strides, refined, problem = [1] * len(plan.records), False, _visible(plan, problem)
     while True:
         runs = plan.runs(strides)
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
