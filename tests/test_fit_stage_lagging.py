@@ -1,5 +1,6 @@
 """Fast runs behind a lag, which begin in the middle of their motion and never get to the ends of their command."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from _command import run
@@ -11,6 +12,8 @@ import data_synth
 import fits
 import microid as m
 from fits.diagnosis import _baseline
+from fits.stage._solve import Problem
+from fits.stage._steps import Plan, _visible
 
 RATE_Hz, LAG_s, FINE = 10_000.0, 0.55e-3, 40
 
@@ -106,3 +109,18 @@ def test_a_driver_faster_than_a_sample_is_seen_under_steps(rng):
         # Sixteen steps per sample follow it to some thousandths.
         assert abs(result[name].value - value) < 5 * result[name].sd + 5e-3 * value
     assert result.in_sample.rms_um < 1.1 * 0.015
+
+
+@pytest.mark.parametrize(
+    ("hold", "tau_s", "begun_s"), [("zero", 1e-9, 8e-5), ("zero", 3e-4, 3e-4), ("first", 1e-6, 1e-6)]
+)
+def test_a_fit_begins_with_a_driver_that_held_commands_show(hold, tau_s, begun_s):
+    """One that settles between steps has no derivative; the study of held commands fits such rigs."""
+    record = fits.Record(4e-4 * np.arange(50), np.arange(50.0), np.arange(50.0), source="run.csv")
+    parts = {"driver": m.Driver(tau_s), "piezo": m.Piezo(0.2), "mechanics": m.Mechanics(120.0, 0.05)}
+    stage = m.Stage.of(hold=hold, **parts).freeze("driver.gain", "mechanics.gain")
+    plan = Plan((record,), ("unknown",), 0.0, (0.0, 49.0), "squares", lambda _: None, None, (hold,), False)
+    problem = _visible(plan, Problem.of(stage, None, np.zeros(0), None, 1.0))
+    begun = problem.chain.stage(jnp.asarray(problem.z), jnp.zeros(0))
+    assert float(begun["driver"].time_constant_s) == pytest.approx(begun_s, rel=1e-3)
+    assert float(begun["mechanics"].natural_frequency_Hz) == pytest.approx(120.0)
