@@ -115,8 +115,8 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
         return none
     # The area of the peak, whose bins stand for two each.
     square = float(np.exp(height) * np.pi / 2 * width_Hz / bin_Hz * 2 / n)
-    # Noise of this width forgets its phase within as many cycles as its quality, of which a record may have few.
-    forgets = min(max(quality, 1.0) / (middle_Hz * interval_s), n / 3)
+    # Noise of this width forgets its phase within a third of as many cycles as its quality.
+    forgets = max(quality / np.pi, 1.0) / (middle_Hz * interval_s)
     if _comes_back(residual, command_V, forgets) > _SHARE * square:
         return none
     size_um = scale_um * square**0.5
