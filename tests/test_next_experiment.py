@@ -177,6 +177,8 @@ def by_least_squares(made, true, other, time_s, voltage_V):
         ahead[i] += 1e-4
         out = bench.respond([[law.effect(ahead, run)] for run in range(2)])
         tangent.append([(a - p - c) / 1e-4 for a, p, c in zip(out, bench.plain, changes[1], strict=True)])
+    # What has no size of roughness is not among what follows.
+    kinds = list(zip(regression.finer, made.projector.roughness, strict=False))
     rows = []
     for k, run in enumerate(runs):
         own = [
@@ -184,15 +186,15 @@ def by_least_squares(made, true, other, time_s, voltage_V):
             for i, o in enumerate(regression.nuisance)
         ]
         block = np.concatenate(
-            [regression.rows[k], *(kind[k] for kind in regression.finer), *own, np.stack([t[k] for t in tangent], 1)],
+            [regression.rows[k], *(kind[k] for kind, _ in kinds), *own, np.stack([t[k] for t in tangent], 1)],
             axis=1,
         )
         rows.append(np.c_[block, changes[0][k] - changes[1][k]][run.fitted] / noise)
     wide = rows[0].shape[1]
-    priors = np.zeros((len(regression.root) + sum(kind[0].shape[1] for kind in regression.finer), wide))
+    priors = np.zeros((len(regression.root) + sum(kind[0].shape[1] for kind, _ in kinds), wide))
     priors[: len(regression.root), : len(regression.root)] = regression.root
     at = len(regression.root)
-    for kind, size in zip(regression.finer, (0.02, 0.05), strict=True):
+    for kind, size in kinds:
         width = kind[0].shape[1]
         priors[at : at + width, regression.size + at - len(regression.root) :][:, :width] = np.eye(width) / size
         at += width
