@@ -306,9 +306,12 @@ def hysteresis_alone(stage: Stage, runs: Sequence[Run]) -> list[np.ndarray]:
 def _visible(plan: Plan, problem: Problem) -> Problem:
     """The same from drivers that samples show: no derivative leads back to one that settles between held commands."""
     stage = problem.chain.stage(jnp.asarray(problem.z), jnp.asarray(problem.columns_um))
-    for name, driver in named_parts(stage, Driver) if "zero" in plan.holds else ():
-        tau_s = jnp.maximum(driver.time_constant_s, _SETTLED * plan.interval_s)
-        stage = stage.swap(name, replace(driver, time_constant_s=tau_s))
+    least_s = _SETTLED * plan.interval_s
+    quick = [(name, one) for name, one in named_parts(stage, Driver) if float(one.time_constant_s) < least_s]
+    if "zero" not in plan.holds or not quick:
+        return problem
+    for name, driver in quick:
+        stage = stage.swap(name, replace(driver, time_constant_s=jnp.asarray(least_s)))
     return replace(problem, z=np.asarray(problem.chain.coordinates.of(stage)))
 
 
