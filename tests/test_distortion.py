@@ -73,7 +73,7 @@ def test_distortion_of_the_drive_is_found_and_told_ahead(rng):
 
 @pytest.mark.study
 def test_squares_of_the_strain_are_found_and_told_ahead_on_most_stages(rng):
-    """On 2 of 25 stages more than 0.4 was left, on one 0.13 off; by chance on five of nine once in 1,500 times."""
+    """On 2 of 25 stages more than 0.4 was left, on one 0.13 off; by chance on five of nine once in 3,000 times."""
     ratio, off = np.array([told(rng, squares) for _ in range(9)]).T
     assert np.median(ratio) < 0.4
     assert np.median(np.abs(off)) < 0.1
