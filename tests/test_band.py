@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from fits.diagnosis._noise import _one_floor
+from fits.diagnosis._noise import _bands, _one_floor
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._band import Band, band_of
 
@@ -85,3 +85,31 @@ def test_what_a_run_may_play_is_the_floor_where_another_run_shows_it():
     for elsewhere in (replace(other, frequency_Hz=70.0), replace(other, z=2.0)):
         assert seen not in (_one_floor([seen, elsewhere], THRESHOLDS), _one_floor([elsewhere, seen], THRESHOLDS))
     assert _one_floor([seen], THRESHOLDS).played
+
+
+def ringing(rng, middle_Hz, quality, n, rate_Hz):
+    """Noise through a resonance, of variance one."""
+    radius = np.exp(-np.pi * middle_Hz / quality / rate_Hz)
+    past = [1.0, -2 * radius * np.cos(2 * np.pi * middle_Hz / rate_Hz), radius**2]
+    wave = lfilter([1.0], past, rng.standard_normal(n + 20_000))[20_000:]
+    return wave / np.std(wave)
+
+
+def test_a_band_of_one_run_that_another_would_show_is_not_the_floors(rng):
+    """Of 400 records of a floor none was said to be alone; of a line of one run alone, all."""
+
+    def found(*residuals):
+        return _one_floor(_bands(list(residuals), THRESHOLDS), THRESHOLDS).alone
+
+    n, rate_Hz = 6000, 800.0
+    time_s = np.arange(n) / rate_Hz
+    quiet = [0.3 * rng.standard_normal(n) for _ in range(2)]
+    line = np.sin(2 * np.pi * 97.9 * time_s)
+    settings = 1 / rate_Hz, time_s
+    assert found((line + quiet[0], *settings), (quiet[1], *settings))
+    # Where it is too short to tell, or too slowly sampled, it may be there.
+    for short in ((quiet[1][:30], *settings), (quiet[1], 1 / 200, time_s)):
+        assert not found((line + quiet[0], *settings), short)
+    floor = ringing(rng, 26.0, 15.0, 2 * n, rate_Hz)
+    parts = [(part + own, *settings) for part, own in zip(np.split(floor, 2), quiet, strict=True)]
+    assert not found(*parts)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from fits.diagnosis._noise import _without_cycles
 from fits.diagnosis._thresholds import THRESHOLDS
@@ -37,3 +38,16 @@ def test_noise_and_what_repeats_itself_with_time_stay(rng):
     for left in (noise, hum):
         (rest,) = _without_cycles([left], [position_um], used, THRESHOLDS)
         assert rest is left
+
+
+def test_evidence_of_a_period_is_in_units_of_what_is_left(rng):
+    """Structure that noise was not read off makes any period look certain in units of that noise."""
+    time_s = np.linspace(0, 10, 6000)
+    position_um = 15 + 10 * np.sin(3 * time_s) + 4 * np.sin(7.7 * time_s + rng.uniform(0, 6))
+    noise = rng.standard_normal(len(position_um))
+    wandering = 3 * lfilter([1.0], [1.0, -0.3], rng.standard_normal(len(position_um)))
+    assert cycles([noise + wandering], [position_um]).z < THRESHOLDS.cycles
+    wave = np.sin(2 * np.pi * position_um / 0.3)
+    found = cycles([noise + 20 * wave], [position_um])
+    assert found.z > THRESHOLDS.cycles
+    assert found.drop == pytest.approx(200 * len(position_um), rel=0.1)

@@ -299,3 +299,17 @@ def test_where_all_causes_were_left_out_nothing_is_told_beside_what_they_had_tau
     before = Selection((), *(None,) * 6, *(SimpleNamespace(beside=lambda _, one=one: one) for one in (smooth, rough)))
     told = _misfit._in_noise(before, ())
     assert told.model.rows == told.projector.rows == 74
+
+
+def test_a_whitened_residual_has_a_size_in_um(rng):
+    """Of a narrow band whitening leaves little, which is large before it, and runs have noise of their own."""
+    lengths, slow = (3000, 5000), np.array([1.9, -0.95])
+    reg = regression(rng, lengths=lengths)
+    noise = [Noise(0.01, slow), Noise(2.0, WHITE)]
+    projector = Projector(reg, noise)
+    shaking = lfilter([0.01], np.r_[1.0, -slow], rng.standard_normal(lengths[0]))
+    quiet = 0.5 * rng.standard_normal(lengths[1])
+    found = projector.unit_um(projector.join([shaking, quiet]))
+    size_um = np.sqrt(np.mean(np.concatenate([shaking, quiet]) ** 2))
+    # Of white numbers of variance one in the first run and 1/16 in the second.
+    assert found == pytest.approx(size_um / np.sqrt((3000 + 5000 / 16) / 8000), rel=0.15)

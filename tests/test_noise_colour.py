@@ -65,3 +65,10 @@ def test_colour_is_asked_where_nothing_was_idle(rng):
     found = pooled([Floor(level, 0, Spectrum.of(left)), Floor(level, 4000)], THRESHOLDS.apart_z)
     assert found[0].noise.total_um == pytest.approx(1.0, rel=0.35)
     assert found[1].noise == level
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_a_whitened_signal_is_coloured_again(rng, spread):
+    values = np.cumsum(rng.standard_normal(500))
+    noise = Noise(0.03, np.array([1.2, -0.5]), rng.uniform(1, 3, 500) if spread else None)
+    np.testing.assert_allclose(noise.colour(noise.whiten(values)), values, rtol=1e-9, atol=1e-9)

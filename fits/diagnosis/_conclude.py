@@ -76,6 +76,7 @@ def conclude(
     noise = found.projector.noise if found.causes and beside.is_narrow(thresholds) else beside.noise
     found, told, misfit, repeated, minor = worth_naming(ready, found, noise, rounded)
     rest_noise, left_over = misfit.rest_noise, misfit.is_left_over
+    unit_um = told.first.unit_um(told.plain.residual)
     progress(Step.EXTENSION)
     extension = extend_stage(ready, found, found.model if found.causes else None)
     model, kept, remarks = found.model, found.causes, [*_remarks(ready, records)]
@@ -106,7 +107,7 @@ def conclude(
         how = "the stage is left plain" if plain else "the extended stage is without"
         remarks.append(f"{own}: not the same in the runs held out, so that {how}")
     # Up to its own size rounding makes structure, too.
-    left_over = left_over and not (rounded and rest_noise * noise_um < rounding_um)
+    left_over = left_over and not (rounded and rest_noise * unit_um < rounding_um)
     cyclic = (
         not rounded
         and repeated.z > thresholds.cycles
@@ -117,15 +118,16 @@ def conclude(
             f"what is left repeats itself every {length(repeated.period_um)} of the position, as the error of an "
             "interferometer or an encoder does, and a hysteresis of few plays"
         )
-    rest_um = rest_noise * noise_um if left_over else 0.0
+    rest_um = rest_noise * unit_um if left_over else 0.0
     faults = _standing(
         ready.faults, beside if kept else ready.faults, extension.compared, rest_um, thresholds.spike_z
     )
     unlike, in_bursts = irregular(told.first, told.plain.residual, thresholds)
     bursts = in_bursts and not kept and not rounded
     rings = faults.is_narrow(thresholds) and faults.rings_itself(baseline.resonance_Hz, thresholds)
-    named = name_faults(faults, cyclic, bursts or rings, thresholds)
-    removed = misfit.share, misfit.explained / misfit.count * noise_um**2
+    lone = faults.band.alone and faults.makes_noise(thresholds) and not cyclic
+    named = name_faults(faults, cyclic, bursts or rings or lone, thresholds)
+    removed = misfit.share, misfit.explained / misfit.count * unit_um**2
     causes = causes_of(kept, model, found, removed, named, ready.faults, has_time)
     if kept and not has_time():
         remarks.append(
@@ -171,11 +173,19 @@ def conclude(
             f"what is left rings near {faults.band.frequency_Hz:.4g} Hz, where the stage itself does after all that "
             "its model lacks: a vibration of the floor there cannot be told from that"
         )
+    elif lone:
+        remarks.append(
+            f"what is left has a line near {faults.band.frequency_Hz:.4g} Hz, of {length(faults.band.size_um)}, that "
+            "other runs would show and do not: no vibration of the floor, but perhaps something faster that sampling "
+            "folds there"
+        )
+    if lone:
+        left_over, rest_noise = True, max(rest_noise, faults.band.size_um / unit_um)
     if bursts or rings:
         left_over = True
         excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
-    unexplained_um = rest_noise * noise_um if left_over else 0.0
+    unexplained_um = rest_noise * unit_um if left_over else 0.0
     moving = [cause for cause in causes if not card_of(cause.name).statistic]
     compared = extension.compared
     if baseline.aside:

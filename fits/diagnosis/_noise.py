@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
-from fits.stats._band import Band, band_of
+from fits.stats._band import Band, band_of, may_hold
 from fits.stats._cycles import cycles, without_cycles
 from fits.stats._noise import Noise, quantum_um, rough_noise_um
 from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
@@ -51,6 +52,12 @@ class Faults:
         band = self.band
         return band.z > thresholds.strong_z and band.narrow and not band.mains and not band.played
 
+    def makes_noise(self, thresholds: Thresholds) -> bool:
+        """Whether such a band is a part of the noise that counts."""
+        least_um2 = thresholds.minor_share / 3 * float(np.mean([n.total_um**2 for n in self.noise]))
+        # Up to its own size rounding makes lines, too, where a motion is even.
+        return self.is_narrow(thresholds) and self.band.size_um**2 > max(least_um2, self.quantum_um**2 / 12)
+
     def rings_itself(self, resonance_Hz: float | None, thresholds: Thresholds) -> bool:
         """Whether the band is at the stage's resonance, which rings after all that a model lacks."""
         if resonance_Hz is None:
@@ -86,7 +93,7 @@ def find_faults(
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
     # Rounding is noise that a command at rest does not show.
     least = quantum / 12**0.5
-    floors, found, heights, jitters, bands, fast, positions = [], [], [], [], [], [], []
+    floors, found, heights, jitters, shaken, fast, positions = [], [], [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     # After so many e-folds a motion has settled.
     settling_s = float(8.0 / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
@@ -112,8 +119,8 @@ def find_faults(
         rate = np.gradient(position, run.record.time_s)
         size, z, most = jitter_s(smooth[mask], rate[mask], least, thresholds.apart_z)
         jitters.append((z, size, np.abs(rate), most))
-        interval = float(np.median(np.diff(run.record.time_s)))
-        bands.append(band_of(smooth[mask], interval, voltage_V[mask]))
+        interval_s = float(np.median(np.diff(run.record.time_s)))
+        shaken.append((smooth[mask], interval_s, voltage_V[mask]))
     floors = pooled(floors, thresholds.apart_z)
     noise = [one.noise if one.noise.total_um > least else white_noise(least) for one in floors]
     z, size, _, _ = max(jitters, key=lambda j: j[0])
@@ -124,7 +131,7 @@ def find_faults(
             replace(n, spread=np.sqrt(1 + (size * rate / n.innovation_um) ** 2))
             for n, (_, _, rate, _) in zip(noise, jitters, strict=True)
         ]
-    band = _one_floor(bands, thresholds)
+    band = _one_floor(_bands(shaken, thresholds), thresholds)
     source = "idle stretches where there are any, and the fastest changes of the residual elsewhere"
     if all(floor.idle for floor in floors):
         source = "idle stretches of the runs"
@@ -148,7 +155,18 @@ def _one_floor(bands: list[Band], thresholds: Thresholds) -> Band:
     for k, one in enumerate(bands):
         others = [b for j, b in enumerate(bands) if j != k and not b.played and b.z > thresholds.determined_z]
         seen.append(replace(one, played=one.played and not any(one.agrees(other) for other in others)))
-    return max(seen, key=lambda one: (not one.mains and not one.played, one.z))
+    strong_z = thresholds.strong_z
+    return max(seen, key=lambda one: (not one.mains and not one.played, one.z > strong_z and not one.alone, one.z))
+
+
+def _bands(residuals: list[tuple[np.ndarray, float, np.ndarray]], thresholds: Thresholds) -> list[Band]:
+    """The band of each residual, given with its sampling interval and its command, and whether it is there alone."""
+    found, chance = [], float(scipy.stats.norm.sf(thresholds.worse_z))
+    for k, residual in enumerate(residuals):
+        band, others = band_of(*residual), residuals[:k] + residuals[k + 1 :]
+        alone = band.z > thresholds.strong_z and not all(may_hold(band, *one[:2], chance) for one in others)
+        found.append(replace(band, alone=alone))
+    return found
 
 
 def _between(values: np.ndarray, bad: np.ndarray) -> np.ndarray:
@@ -207,9 +225,7 @@ def name_faults(
         jitter = "jitter_s", faults.jitter_s, faults.jitter_s / (2 * max(faults.jitter_z, 1e-9)), "s"
         found.append(Fault("jitter", faults.jitter_z, (jitter,), faults.jitter_um**2))
     band = faults.band
-    narrow = faults.is_narrow(thresholds) and not cyclic and not mistaken
-    # Up to its own size rounding makes lines, too, where a motion is even.
-    if narrow and band.size_um**2 > max(thresholds.minor_share / 3 * total, step**2 / 12):
+    if faults.makes_noise(thresholds) and not cyclic and not mistaken:
         middle = "frequency_Hz", band.frequency_Hz, band.frequency_Hz / band.quality, "Hz"
         size_of_band = "amplitude_um", band.size_um, band.sd_um, "um"
         found.append(Fault("band", band.z, (size_of_band, middle), band.size_um**2))

@@ -228,9 +228,9 @@ class PlainFit:
         if "zero" in other.holds:
             # They need no parameter.
             return self.left_beside_lag() < rest - _PLAIN * (rest - len(left))
-        # Of what is more than noise either way, a small part decides nothing.
+        # Of what is more than noise either way, a small part decides nothing, unless the best effect explains less.
         here = float(self.left @ self.left)
-        if here - whole < _NOISE * (here - len(left)):
+        if here - whole < min(_NOISE * (here - len(left)), self.largest_z() ** 2):
             return True
         beside = min(self.left_beside_lag(), self.left_beside_delay())
         return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)

@@ -217,6 +217,15 @@ class Projector:
         stops = np.cumsum([int(mask.sum()) for mask in self.masks])
         return np.split(joined[: self.count], stops[:-1])
 
+    def unit_um(self, joined: np.ndarray) -> float:
+        """What one standard deviation of a joined signal is before it is whitened, root mean square."""
+        square = 0.0
+        for part, noise, mask in zip(self.split(joined), self.noise, self.masks, strict=True):
+            whole = np.zeros(len(mask))
+            whole[mask] = part
+            square += float(np.sum(noise.colour(whole)[mask] ** 2))
+        return (square / max(float(joined[: self.count] @ joined[: self.count]), 1e-300)) ** 0.5
+
     def step(self, joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Steps of coordinates and columns by which the baseline follows a joined signal best."""
         answer = self._answer(joined)

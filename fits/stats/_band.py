@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
@@ -36,7 +37,8 @@ _QUALITIES, _HEIGHTS = tuple(2.0**k for k in range(9)), tuple(4.0**k for k in ra
 class Band:
     """The strongest narrow band of a residual: middle, size (rms) and its sd, quality, evidence, and bins.
 
-    A band is `played` if it is as narrow as a line and at a multiple of one of the command's.
+    A band is `played` if it is as narrow as a line and at a multiple of one of the command's, and `alone` if another
+    residual would show it, too, and does not.
     """
 
     frequency_Hz: float
@@ -47,6 +49,7 @@ class Band:
     rate_Hz: float = 0.0
     bins: int = 1
     played: bool = False
+    alone: bool = False
 
     @property
     def narrow(self) -> bool:
@@ -124,6 +127,23 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     sd_um = size_um / (2 * max(width_Hz * n * interval_s, 1.0) ** 0.5)
     z = max(2 * (found - nothing - np.log(inside.sum())), 0.0) ** 0.5
     return Band(middle_Hz, size_um, sd_um, quality, float(z), 1 / interval_s, bins, played)
+
+
+def may_hold(band: Band, residual_um: FloatArray, interval_s: float, chance: float) -> bool:
+    """Whether a residual, evenly sampled, of shape `(n,)`, may hold a band that another one showed.
+
+    It holds too little where noise of that width makes as little with a probability below `chance`, even with half
+    its variance. A residual that is too short, or too slowly sampled, may hold any.
+    """
+    n, middle_Hz = len(residual_um), band.frequency_Hz
+    if not _CYCLES / (n * interval_s) < middle_Hz < 0.45 / interval_s:
+        return True
+    power = _power(residual_um)
+    width_Hz = middle_Hz / max(band.quality, 1.0)
+    near = np.abs(np.fft.rfftfreq(n, interval_s) - middle_Hz) <= max(width_Hz, _LINE / 2 / (n * interval_s))
+    part = 2 / n * float(power[near].sum()) / (_SHARE * band.size_um**2)
+    freedom = 2 * max(width_Hz * n * interval_s, 1.0)
+    return bool(stats.chi2.cdf(freedom * part, freedom) >= chance)
 
 
 def _comes_back(residual: FloatArray, command_V: FloatArray, apart: float) -> float:

@@ -25,7 +25,7 @@ class Cycles:
 def cycles(residuals: Sequence[np.ndarray], positions_um: Sequence[np.ndarray]) -> Cycles:
     """Search residuals of some runs, in noise, for a period in their positions, shape `(n,)` each.
 
-    Each run has an amplitude and a phase of its own.
+    Each run has an amplitude and a phase of its own. Where more than noise is left, the evidence is in units of that.
     """
     low_um = min(float(position.min()) for position in positions_um)
     span_um = max(max(float(position.max()) for position in positions_um) - low_um, 1e-300)
@@ -34,7 +34,7 @@ def cycles(residuals: Sequence[np.ndarray], positions_um: Sequence[np.ndarray]) 
     for residual, position in zip(residuals, positions_um, strict=True):
         place = np.minimum((_BINS * (position - low_um) / span_um).astype(int), _BINS - 1)
         lines = np.fft.rfft(np.bincount(place, residual, _BINS), _PADDED)[first:stop]
-        drops += 2 * np.abs(lines) ** 2 / len(residual)
+        drops += 2 * np.abs(lines) ** 2 / max(float(residual @ residual), len(residual))
     best = int(np.argmax(drops))
     logs = stats.chi2.logsf(drops[best], 2 * len(residuals)) + np.log(len(drops))
 
@@ -45,7 +45,7 @@ def cycles(residuals: Sequence[np.ndarray], positions_um: Sequence[np.ndarray]) 
 
     near = (first + best + np.array([-1, 1])) * _BINS / _PADDED
     rate = float(minimize_scalar(lambda rate: -drop(rate), bounds=near, method="bounded").x)
-    return Cycles(span_um / rate, float(-logs), max(drop(rate), float(drops[best])))
+    return Cycles(span_um / rate, float(-logs), drop(rate))
 
 
 def without_cycles(

@@ -128,6 +128,15 @@ class Noise:
             values = values / self.spread.reshape(-1, *(1,) * (values.ndim - 1))
         return values / self.innovation_um
 
+    def colour(self, values: np.ndarray) -> np.ndarray:
+        """Undo that, for values of one signal, shape `(n,)`."""
+        values = self.innovation_um * (values if self.spread is None else values * self.spread)
+        if len(self.past):
+            from scipy.signal import lfilter
+
+            values = lfilter([1.0], np.r_[1.0, -self.past], values)
+        return values
+
 
 def rough_noise_um(residual_um: np.ndarray) -> float:
     """Standard deviation of white noise in a residual, by its second differences, whatever slowly changes."""

@@ -74,7 +74,9 @@ def floor_of(
             correlated = abs(correlation) * len(joined) ** 0.5 > same_z
             return Floor(learn_noise(joined, freedom) if correlated else white_noise(level), len(joined))
     left_um = residual_um[used]
-    return Floor(white_noise(max(rough_noise_um(left_um), least_um)), 0, Spectrum.of(left_um))
+    # Noise that alternates from sample to sample is no larger than all that is left.
+    level = min(rough_noise_um(left_um), float(np.std(left_um)))
+    return Floor(white_noise(max(level, least_um)), 0, Spectrum.of(left_um))
 
 
 def white_noise(level_um: float) -> Noise:
