@@ -10,14 +10,13 @@ from scipy import stats
 
 import fits
 from fits import Record
-from fits.diagnosis import _diagnose, _findings, _misfit
+from fits.diagnosis import _diagnose, _findings
 from fits.diagnosis._effects import Law
-from fits.diagnosis._explanation import Cause, Selection
+from fits.diagnosis._explanation import Cause
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._misfit import Misfit
 from fits.diagnosis._prepare import Prepared, _covered
 from fits.diagnosis._result import Gain
-from fits.diagnosis._thresholds import Thresholds
 from fits.stage._fit import default_stage
 from fits.stats._compare import improvement_z
 from fits.stats._held import _regressed, _stretches_at_rest
@@ -59,73 +58,6 @@ def test_causes_share_what_is_beyond_chance():
     assert misfit(9.0, 39.0).unnamed(weak=False) == (pytest.approx(0.03), True)
     assert not misfit(1.0, 300.0).unnamed(weak=False)[1]
     assert not misfit(9.0, 39.0).unnamed(weak=True)[1]
-
-
-def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=()):
-    """Names that are kept where each cause explains a part of its own, in noise variances, and so much is left.
-
-    With each of those that are harmful, what was held out is predicted worse, and with those that are helpful better;
-    the strengths of those that are unsure are nearer to none than their standard deviation.
-    """
-
-    def cost(names):
-        return rest + sum(part for name, part in parts.items() if name not in names)
-
-    def model(names):
-        errors = np.ones(100) * (1 + sum(name in harmful for name in names)) / (1 + sum(n in helpful for n in names))
-        strength_z = [0.5 if name in unsure else 9.0 for name in names]
-        return SimpleNamespace(cost=cost(names), change_um=errors, strength_z=strength_z.__getitem__)
-
-    def without(found, name):
-        return model([cause.name for cause in found.causes if cause.name != name])
-
-    def misfit_of(_, found, __):
-        return misfit(cost(()) - found.model.cost, rest), None
-
-    monkeypatch.setattr(_misfit, "_without", without)
-    monkeypatch.setattr(_misfit, "_in_noise", lambda found, _: found)
-    monkeypatch.setattr(_misfit, "_misfit", misfit_of)
-    causes = tuple(Cause(name, 9.0, 0.0, (), part) for name, part in parts.items())
-    projector = SimpleNamespace(held_out=lambda errors: errors)
-    found = Selection(causes, model([*parts]), *(None,) * 5, projector, None)
-    ready = SimpleNamespace(reading=SimpleNamespace(thresholds=Thresholds()))
-    kept, _, last, _, said = _misfit.worth_naming(ready, found, (), False)
-    names = [cause.name for cause in kept.causes]
-    assert last.explained == pytest.approx(sum(parts[name] for name in names))
-    left_out = [words.split(" would")[0].split(" is not")[0].replace(" ", "_") for words in said]
-    assert sorted(left_out) == sorted({*parts} - {*names})
-    # The smallest first.
-    assert harmful or unsure or left_out == sorted(left_out, key=parts.__getitem__)
-    return names
-
-
-def test_what_the_rest_may_make_is_not_named(monkeypatch):
-    chance = 40 + 3 * 80**0.5
-    parts = {"transport_delay": 8000.0, "thermal_gain": 170.0, "creep": 90.0}
-    assert named_beside(monkeypatch, parts, chance + 2500.0) == ["transport_delay"]
-    assert named_beside(monkeypatch, parts, chance) == [*parts]
-    # A third of what there is beside the others is more than a minor share.
-    assert named_beside(monkeypatch, parts, chance + 300.0) == ["transport_delay", "thermal_gain"]
-    # One cause alone is decided on by its share of the whole misfit; a hum is no other effect's misfit.
-    assert named_beside(monkeypatch, {"creep": 90.0}, chance + 2500.0) == ["creep"]
-    assert named_beside(monkeypatch, {"creep": 8000.0, "mains_hum": 90.0}, chance + 2500.0) == ["creep", "mains_hum"]
-
-
-def test_what_predicts_worse_is_not_named_beside_others(monkeypatch):
-    parts = {"creep": 8000.0, "friction": 4000.0, "mains_hum": 90.0}
-    chance = 40 + 3 * 80**0.5
-    assert named_beside(monkeypatch, parts, chance, ["friction"]) == ["creep", "mains_hum"]
-    assert named_beside(monkeypatch, parts, chance, ["friction", "mains_hum"]) == ["creep"]
-
-
-def test_what_may_be_none_is_named_only_where_it_predicts(monkeypatch):
-    parts = {"creep": 8000.0, "second_resonance": 4000.0}
-    chance = 40 + 3 * 80**0.5
-    assert named_beside(monkeypatch, parts, chance, unsure=["second_resonance"]) == ["creep"]
-    beyond = {"unsure": ["second_resonance"], "helpful": ["second_resonance"]}
-    assert named_beside(monkeypatch, parts, chance, **beyond) == [*parts]
-    assert named_beside(monkeypatch, {"creep": 8000.0}, chance, unsure=["creep"]) == []
-    assert named_beside(monkeypatch, {"creep": 8000.0}, chance, unsure=["creep"], helpful=["creep"]) == ["creep"]
 
 
 def compared(before, after):

@@ -84,9 +84,9 @@ def worth_naming(
 ) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
     """Leave out causes that are not worth naming beside the others, the worst first.
 
-    Their strength may be none, they make predictions of what was held out worse, or they explain a minor share of
-    what the others leave: what explains the rest may explain that. Returns what was found, the same in the given
-    noise, and what is said of causes that were left out.
+    Their strength may be none, they make predictions of what was held out worse, or are weak and small and make them
+    no better, or they explain a minor share of what the others leave: what explains the rest may explain that.
+    Returns what was found, the same in the given noise, and what is said of causes that were left out.
     """
     said: list[str] = []
     while True:
@@ -116,7 +116,13 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     if is_worse(before, after, thresholds.worse_z, thresholds.model_error):
         worse = float(np.sum(after**2) - np.sum(before**2))
         return -worse, name, "what was held out is predicted worse with it than with the other causes alone"
-    part = replace(misfit, explained=fewer.cost - found.model.cost).share
+    explained = fewer.cost - found.model.cost
+    weak = max(cause.z for cause in found.causes if cause.name == name) < thresholds.strong_z
+    small = explained < thresholds.rest_noise**2 * misfit.count
+    if weak and small and improvement_z(before, after) < thresholds.worse_z:
+        why = "it is weak and small, and nothing that was held out is predicted better with it"
+        return -1 / max(explained, 1e-300), name, why
+    part = replace(misfit, explained=explained).share
     if card_of(name).independent or part >= thresholds.minor_share:
         return None
     share = f"{100 * part:.0f} %" if part > SHOWN else "hardly any"

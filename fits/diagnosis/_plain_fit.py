@@ -126,13 +126,18 @@ class PlainFit:
         def delayed(holds: Holds) -> float:
             return self.delay_drop(self.left_under(holds))
 
+        def alone(holds: Holds) -> float:
+            return gained(holds) - least * sum(hold != own for hold, own in zip(holds, taken, strict=True))
+
         def worth(holds: Holds) -> float:
             # A delay beside them is one cause more.
-            others = sum(hold != own for hold, own in zip(holds, taken, strict=True))
-            return gained(holds) + (1 - off) * delayed(holds) - least * others
+            return alone(holds) + (1 - off) * delayed(holds)
 
-        starts = taken, *((hold,) * len(taken) for hold in _HOLDS)
-        found = max((_climbed(worth, start) for start in starts), key=worth)
+        def most(worth: Callable[[Holds], float]) -> Holds:
+            starts = taken, *((hold,) * len(taken) for hold in _HOLDS)
+            return max((_climbed(worth, start) for start in starts), key=worth)
+
+        found = most(worth)
         if {*found} - {*taken} >= {"zero"}:
             without = tuple(_HOLDS[0] if hold == "zero" else hold for hold in found)
             late, more = delayed(without), gained(found) - gained(without)
@@ -154,7 +159,9 @@ class PlainFit:
             return alike if by(alike) > by(holds) - own else holds
 
         if "zero" in found and found != taken:
-            return shared(found) if gained(found) > least and beside(found) > (1 - off) * best else taken
+            # What only a delay beside it would be worth may hide what needs none.
+            ways = (way for way in (found, most(alone)) if gained(way) > least and beside(way) > (1 - off) * best)
+            return shared(next(ways, taken))
         # A large effect may hide between the samples what only shows beside it.
         each = [{k} for k in range(len(taken))] + [set(range(len(taken)))]
 
