@@ -92,13 +92,15 @@ def test_runs_of_one_rig_go_apart_only_where_that_is_more_than_a_small_part_of_t
     assert (PlainFit.better_holds(fit, THRESHOLDS) == ("zero", "first")) == mixed
 
 
-@pytest.mark.parametrize(("curves", "kept"), [(22.31, True), (22.6, True), (10.0, False)])
-def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(monkeypatch, curves, kept):
-    # In noise variances; as much as 22.5 is left beside lines.
+@pytest.mark.parametrize(
+    ("curves", "best_z", "kept"), [(22.31, 60.0, True), (22.31, 30.0, False), (22.6, 30.0, True), (10.0, 60.0, False)]
+)
+def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(monkeypatch, curves, best_z, kept):
+    # In noise variances; as much as 22.5 is left beside lines. The best effect there may explain less than curves.
     lines, there = np.full(10_000, 22.5**0.5), np.full(10_000, curves**0.5)
     projector = SimpleNamespace(off=lambda joined: joined, residual=there)
     monkeypatch.setattr(_plain_fit, "Projector", lambda *_: SimpleNamespace(bounded=lambda: projector))
     nothing = {"left_beside_lag": lambda: np.inf, "left_beside_delay": lambda: np.inf}
-    fit = SimpleNamespace(left=lines, faults=SimpleNamespace(noise=None), **nothing)
+    fit = SimpleNamespace(left=lines, faults=SimpleNamespace(noise=None), largest_z=lambda: best_z, **nothing)
     other = SimpleNamespace(regression=None, holds=("smooth",), largest_z=lambda: 30.0)
     assert PlainFit.outdoes(fit, other) == kept

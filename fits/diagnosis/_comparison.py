@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -11,12 +12,15 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.io._threads import map_in_threads
 from fits.stats._compare import improvement_z
 from microid.effects import EFFECTS, AbstractEffect
 
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 5
+# So many are fitted at a time.
+_TOGETHER = 2
 # Scores below this share of the best are not worth a fit. The instant of an effect is not searched for, and the
 # baseline not fitted again beside it, where it leaves more than the best by these shares of what that explains.
 _WORTH, _PROMISING, _NEAR = 0.4, 0.5, 0.1
@@ -73,12 +77,14 @@ def compare_rivals(
     """
     before, first = projector.held_out(model.change_um), len(model.laws)
     fits, least = list[tuple[Scored, Refit]](), np.inf
-    for one in leaders(scores, bench.baseline.dynamic):
+    first_ones = leaders(scores, bench.baseline.dynamic)
+    for some in (first_ones[k : k + _TOGETHER] for k in range(0, len(first_ones), _TOGETHER)):
         if not fits or has_time():
             # What ends far behind the best so far need not be known exactly.
             enough = least + _NEAR * max(model.cost - least, 0.0)
-            fits.append((one, refit_beside(bench, projector, model, one, enough)))
-            least = min(least, fits[-1][1].cost)
+            settings = [(bench, projector, model, one, enough) for one in some]
+            fits += zip(some, map_in_threads(refit_beside, *zip(*settings, strict=True)), strict=True)
+            least = min(refit.cost for _, refit in fits)
     chance_z = thresholds.chance_z
     noise = [found for _, found in fits if found.is_noise(projector, chance_z)]
     # What ended at its bound is taken only where nothing else explains as much.
@@ -183,42 +189,59 @@ def _ranked(
     out = list[Rival]()
     usual = max(thresholds.apart_z**2, _NEAR * (cost - order[0].cost)) if order else 0.0
     near = least = np.inf
-    ahead: float | None = None
+    quiet = bool(order) and order[0].refit.is_noise(projector, thresholds.chance_z)
 
-    def left_ahead(one: Rival) -> float:
+    @cache
+    def left_ahead(place: int) -> float:
+        one = order[place]
         left = score(projector, asked, one.refit.residual, one.refit.basis()).each
         return one.cost - gain_ahead(left, {one.name}, cost - one.cost, thresholds)
 
-    for place, one in enumerate(order):
-        far = one.cost - order[0].cost > near
-        if far and place < _NEAREST and not order[0].refit.is_noise(projector, thresholds.chance_z):
-            ahead = left_ahead(order[0]) if ahead is None else ahead
-            far = left_ahead(one) - ahead > near
+    def is_far(place: int) -> bool:
+        far = order[place].cost - order[0].cost > near
+        if far and place < _NEAREST and not quiet:
+            far = left_ahead(place) - left_ahead(0) > near
+        return far
+
+    def is_shown(one: Rival) -> bool:
+        return not one.form.lag or one.refit.determined(thresholds.determined_z, False, quiet)
+
+    def ends_of(place: int, far: bool) -> tuple[list[State], list[State]]:
+        """Fits from poles, and the joint one, of which there is none where it is far behind."""
+        one = order[place]
         # The start of a lag is its own, however far it is from here. A lost resonance is looked for beside the best,
         # even where what it rings with passed for noise.
-        on_time = least == np.inf or has_time()
-        joint, is_lag = place < _NEAREST and not far and on_time, bool(one.refit.laws[-1].form.lag)
-        quiet = order[0].refit.is_noise(projector, thresholds.chance_z)
-        shown = not is_lag or one.refit.determined(thresholds.determined_z, False, quiet)
-        starts = on_time and (not quiet if is_lag else place == 0)
-        ends = fit_from_poles(bench, projector, one.refit, not shown) if starts else []
-        if joint and shown:
-            ends.append(fit_jointly(bench, projector, one.refit))
-        if not ends:
-            if shown:
-                out.append(one)
-            continue
-        end = min(ends, key=lambda state: state[-1].cost)
-        found = Rival.of(*end[1:])
-        end[1].release()
-        if not end[-1].possible(bench):
-            continue
-        if least == np.inf:
-            near = max(usual, 2 * abs(one.cost - found.cost))
-        elif found.cost > least + thresholds.apart_z**2:
-            near = usual
-        least = min(least, found.cost)
-        out.append(replace(found, refit=one.refit, end=end))
+        on_time, shown = place == 0 or has_time(), is_shown(one)
+        starts = on_time and (not quiet if one.form.lag else place == 0)
+        joint = shown and on_time and place < _NEAREST and not far
+        fits = [
+            lambda: fit_from_poles(bench, projector, one.refit, not shown) if starts else [],
+            lambda: [fit_jointly(bench, projector, one.refit)] if joint else [],
+        ]
+        from_poles, jointly = map_in_threads(lambda fit: fit(), fits)
+        return from_poles, jointly
+
+    places = list(range(len(order)))
+    # What comes after the best is fitted two at a time.
+    for some in [places[:1], *(places[k : k + _TOGETHER] for k in range(1, len(places), _TOGETHER))]:
+        for place, (ends, joint) in zip(some, map_in_threads(ends_of, some, map(is_far, some)), strict=True):
+            one = order[place]
+            ends = ends if is_far(place) else [*ends, *joint]
+            if not ends:
+                if is_shown(one):
+                    out.append(one)
+                continue
+            end = min(ends, key=lambda state: state[-1].cost)
+            found = Rival.of(*end[1:])
+            end[1].release()
+            if not end[-1].possible(bench):
+                continue
+            if least == np.inf:
+                near = max(usual, 2 * abs(one.cost - found.cost))
+            elif found.cost > least + thresholds.apart_z**2:
+                near = usual
+            least = min(least, found.cost)
+            out.append(replace(found, refit=one.refit, end=end))
     # Of an effect the best form counts, which may be another once the baseline has followed. A form beside which it
     # has not followed stands behind those beside which it has.
     best: dict[str, Rival] = {}

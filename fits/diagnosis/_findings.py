@@ -19,6 +19,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_around
 from fits.diagnosis._result import Bound, FoundCause
 from fits.diagnosis._score import Scored, best_of
+from fits.io._threads import map_in_threads
 from fits.loop._result import ParameterEstimate
 from fits.stage._encode import spec_of
 from fits.stats._held import Held
@@ -190,11 +191,13 @@ def profile_likelihood(
     """
     law, x = model.laws[which], model.x[which]
     sd = np.sqrt(np.diagonal(covariance))
-    found: list[tuple[float, np.ndarray]] = []
-    for path, at in law.common.items():
-        if _is_nonlinear(law, x, at, float(sd[at])):
-            for way in (-1, 1):
-                found += _profile_to(bench, projector, model, which, path, at, way, has_time)
+    nonlinear = [one for one in law.common.items() if _is_nonlinear(law, x, one[1], float(sd[one[1]]))]
+
+    def profile(path: str, at: int, way: int) -> list[tuple[float, np.ndarray]]:
+        return _profile_to(bench, projector, model, which, path, at, way, has_time)
+
+    ways = [(path, at, way) for path, at in nonlinear for way in (-1, 1)]
+    found = [end for ends in map_in_threads(profile, *zip(*ways, strict=True)) for end in ends] if ways else []
     lowest = min([model.cost, *(cost for cost, _ in found)])
     return [(max((cost - lowest) ** 0.5, _FAR_Z), there) for cost, there in found]
 

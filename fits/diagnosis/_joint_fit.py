@@ -15,6 +15,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, relocate
 from fits.diagnosis._regression import regress, saturating
 from fits.diagnosis._thresholds import Thresholds
+from fits.io._threads import map_in_threads
 from fits.stage._run import named_parts
 from fits.stage._start import measure_response, start_lagging, start_stages
 from fits.stage._steps import hysteresis_alone
@@ -99,15 +100,18 @@ def fit_from_poles(bench: Bench, projector: Projector, model: Refit, better: boo
     else:
         away = (one for one in start_stages(baseline.stage, responses) if _resonates_elsewhere(one, baseline.stage))
         found = [(stage, effects) for stage in away]
-    starts = list[State]()
-    for stage, begun in found:
+
+    def begin(stage: Stage, begun: list[AbstractEffect]) -> State:
         there = replace(baseline, z=np.asarray(baseline.chain.coordinates.of(stage)))
         laws, x = model.with_law(len(model.laws) - 1, Law(begun, law.remembers))
         here = refit(bench, projector, laws, x, 0)
         state = _linearised_at(there, projector, here)
-        starts.append((*state, refit(*state, laws, x, 4)))
+        return *state, refit(*state, laws, x, 4)
+
+    starts = map_in_threads(begin, *zip(*found, strict=True)) if found else []
     starts = [state for state in starts if not better or state[-1].cost < model.cost - _BETTER]
-    return [alternate(*state) for state in sorted(starts, key=lambda state: state[-1].cost)[:_STARTS]]
+    best = sorted(starts, key=lambda state: state[-1].cost)[:_STARTS]
+    return map_in_threads(lambda state: alternate(*state), best)
 
 
 def _resonates_elsewhere(stage: Stage, other: Stage) -> bool:
