@@ -205,6 +205,7 @@ def test_exchanged_columns_are_noticed(bench, tmp_path):
 def test_synth_refuses_unknown_scenarios_and_places(tmp_path):
     (tmp_path / "file").write_text("")
     refused(run("synth", "quickstrat", "--out", tmp_path / "q"), "quickstart")
+    refused(run("synth", "bouwen", "--out", tmp_path / "q"), "boucwen")
     refused(run("synth", "quickstart", "--out", tmp_path / "file"), "file")
     assert files(tmp_path) == ["file"]
     listed = run("synth", "--list")

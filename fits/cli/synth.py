@@ -6,6 +6,7 @@ from fits.cli import _common as common
 from fits.cli import _options as options
 from fits.io._errors import DataError
 from fits.io._file_set import file_set
+from fits.io._typed import nearest
 
 
 @click.command()
@@ -44,6 +45,9 @@ def synth(given: common.Given) -> None:
         elif given.samples is not None:
             raise DataError("--samples: only the records of boucwen can be cut; a scenario states its runs.")
         else:
+            known = [*data_synth.scenario_names(), data_synth.BOUCWEN]
+            if not given.scenario.endswith(".toml") and given.scenario not in known:
+                raise DataError(f"no scenario is called '{given.scenario}': {nearest(given.scenario, known)}")
             try:
                 bench = data_synth.simulate(data_synth.load_scenario(given.scenario), given.seed)
             except data_synth.ScenarioError as error:
