@@ -253,6 +253,9 @@ def test_slow_effects_in_closed_form(rng):
             0.01 * (path - 9) ** 2 / 11 - 0.02 * (path - 9) ** 3 / 121,
         ),
     }
+    turn, cosine, sine = 2 * np.pi * (path - 9) / 0.3, np.array([0.01, -0.003]), np.array([-0.02, 0.005])
+    waves = [c * np.cos(k * turn) + s * np.sin(k * turn) for k, c, s in zip((1, 2), cosine, sine, strict=True)]
+    cases["cyclic_error", ""] = (cosine, sine, 0.3, 9.0), sum(waves)
     for key, (given, truth) in cases.items():
         found = through(BY_NAME[key](*given), interval, path, temperature_degC=temperature, other_um=other)
         np.testing.assert_allclose(found - path, truth, atol=1e-9, err_msg=str(key))

@@ -71,9 +71,9 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
 
 
 def test_the_library_and_what_is_outside_of_it():
-    assert len(ds.EFFECTS) == 28
+    assert len(ds.EFFECTS) == 29
     assert not set(ds.EFFECTS) & set(ds.OUTSIDE)
-    assert {"cyclic_error", "offset_jumps", "wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
+    assert {"offset_jumps", "wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
 
 
 @pytest.mark.parametrize("kind", ["plays", "relays"])

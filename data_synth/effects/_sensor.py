@@ -44,7 +44,14 @@ def mains_hum(reading_um: FloatArray, run: Situation, *, amplitude_um: float, ma
     return reading_um + amplitude_um * hum
 
 
-@effect("sensor", "amplitude_um", usual=0.05, limit=2.0, outside=True, between={"period_um": POSITIVE})
+@effect(
+    "sensor",
+    "amplitude_um",
+    usual=0.05,
+    limit=2.0,
+    draws={"period_um": (0.15, 0.8)},
+    between={"period_um": POSITIVE},
+)
 def cyclic_error(
     reading_um: FloatArray, run: Situation, *, amplitude_um: float, period_um: float = 0.316
 ) -> FloatArray:

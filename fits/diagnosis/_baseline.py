@@ -168,7 +168,8 @@ def fit_baseline(
         held = _prepared(aside, range_V, initial, 0.0, [max(many)] * len(aside), past, held_holds)
         return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
-    asked = _prepared(aside, range_V, initial, 0.0, [_FINE] * len(aside), False)
+    # A run whose history is unknown to its end says little of that, and is no error.
+    asked = _prepared(aside, range_V, initial, 1.0, [_FINE] * len(aside), False)
     held_holds = [_hold_of(solved.stage, run, better) for run in asked]
     (runs, held), (finest, finest_held) = prepared(1, max(strides)), prepared(_FINE, max(*strides, _FINE))
     # Behind a step a reading has corners that whole steps do not show to what reads it between samples.

@@ -19,6 +19,8 @@ from microid.effects import EFFECTS, AbstractEffect
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 5
+# Part of a record before which nothing is said to happen in it.
+_INSIDE = 0.02
 # So many are fitted at a time.
 _TOGETHER = 2
 # Scores below this share of the best are not worth a fit. The instant of an effect is not searched for, and the
@@ -251,13 +253,18 @@ def _ranked(
 
 
 def has_occurred(bench: Bench, model: Refit, place: int = -1) -> bool:
-    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for a law."""
+    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for a law.
+
+    It must happen inside that run: what goes on from the first samples is a lag of the whole run, and no loss in it.
+    """
     law, x = model.laws[place], model.x[place]
     found = not law.form.counted
     for run, one in enumerate(bench.prepared):
         interval_s = float(np.median(np.diff(one.run.record.time_s)))
         effect = law.effect(x, run)
-        found = found or any(abs(float(getattr(effect, name))) > interval_s / 2 for name in law.form.counted)
+        inside = float(getattr(effect, "after_s", np.inf)) > _INSIDE * one.run.record.duration_s
+        counted = any(abs(float(getattr(effect, name))) > interval_s / 2 for name in law.form.counted)
+        found = found or (inside and counted)
     return found
 
 
@@ -302,6 +309,8 @@ def gain_ahead(left: Sequence[Scored], causes: Collection[str], explained: float
 
 def model_error(name: str, causes: Collection[str], thresholds: Thresholds) -> float:
     """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
+    if any(form.flexible for form in EFFECTS if form.name == name):
+        return thresholds.confused_error
     own = {other for form in EFFECTS if form.name == name for other in form.confusions}
     if any(f.name in causes and (name in f.confusions or f.name in own) for f in EFFECTS):
         return thresholds.confused_error

@@ -13,8 +13,9 @@ from fits.diagnosis._noise import Faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import Regression
+from fits.diagnosis._residual_tests import repeats_in
 from fits.diagnosis._score import Probe, applicable, law_of, probes_of, scales_of, score
-from fits.diagnosis._thresholds import Thresholds
+from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._threads import map_in_threads
 from microid import Hold
 from microid.effects import EFFECTS, AbstractEffect, Scales
@@ -54,7 +55,9 @@ class PlainFit:
 
     @cached_property
     def scales(self) -> Scales:
-        return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise))
+        repeated = repeats_in(self.projector, self.left, self.bench.plain)
+        period_um = repeated.period_um if repeated.z > THRESHOLDS.cycles else None
+        return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise), period_um)
 
     @cached_property
     def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:

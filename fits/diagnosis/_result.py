@@ -78,7 +78,7 @@ class FoundCause:
 
     @property
     def shown(self) -> tuple[ParameterEstimate, ...]:
-        """The parameters as people read them: of lines the amplitudes, for their cosines and sines."""
+        """The parameters as people read them: of lines and waves the amplitudes, for their cosines and sines."""
         card = self._form
         if not card.phases:
             return self.parameters
@@ -87,7 +87,9 @@ class FoundCause:
         for one in self.parameters:
             field, index, where = _ENTRY.fullmatch(one.name).groups()  # type: ignore[union-attr]
             if field == cosine:
-                line = f"amplitude at {card.lines_Hz[int(index or 0)]:g} Hz{where}"
+                number = int(index or 0)
+                at = f"at {card.lines_Hz[number]:g} Hz" if card.lines_Hz else f"of harmonic {number + 1}"
+                line = f"amplitude {at}{where}"
                 out.append(_amplitude(line, one, known[one.name.replace(cosine, sine, 1)]))
             elif field != sine:
                 out.append(one)

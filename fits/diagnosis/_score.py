@@ -52,8 +52,8 @@ class Probe:
         return 300.0 if self.effects[0].finite else np.inf
 
 
-def scales_of(bench: Bench, noise_um: float) -> Scales:
-    """Measure how large things are in the runs."""
+def scales_of(bench: Bench, noise_um: float, period_um: float | None = None) -> Scales:
+    """Measure how large things are in the runs, whose residual may have a period in the position."""
     baseline, plain = bench.baseline, bench.plain
     records = [run.record for run in baseline.runs]
     fastest = max(float(np.max(np.abs(np.diff(r.voltage_V) / np.diff(r.time_s)))) for r in records)
@@ -74,6 +74,7 @@ def scales_of(bench: Bench, noise_um: float) -> Scales:
         noise_um=noise_um,
         resonance_Hz=baseline.resonance_Hz,
         columns=tuple((name, *value) for name, value in columns.items()),
+        period_um=period_um,
     )
 
 

@@ -49,6 +49,8 @@ class Scales:
         Of the plain stage; None without dynamics.
     columns
         Mean and range of each further column by name, such as `temperature_degC`.
+    period_um
+        With which the residual repeats itself in the position; None where it does not.
     """
 
     lower_V: float
@@ -62,6 +64,7 @@ class Scales:
     noise_um: float
     resonance_Hz: float | None = None
     columns: tuple[tuple[str, float, float], ...] = ()
+    period_um: float | None = None
 
 
 class AbstractEffect(AbstractPart):
@@ -112,7 +115,7 @@ class AbstractEffect(AbstractPart):
         Frequencies of the lines whose amplitudes are the entries of its strengths, and the part by which those may be
         off: samples may turn a line into a drift.
     phases
-        Names of two strengths that are the cosines and the sines of these lines, of which amplitudes are shown. Empty
+        Names of two strengths that are cosines and sines, of these lines if any, of which amplitudes are shown. Empty
         for an effect that is shown by its strengths.
     fingerprint
         What it leaves in the residual of the plain stage, one sentence.
@@ -132,6 +135,8 @@ class AbstractEffect(AbstractPart):
         effect that changes the mean.
     independent
         Whether it goes on whatever the command does, and looks like nothing that depends on the command.
+    flexible
+        Whether its shape bends to what models of other effects leave, so that beside them it takes much evidence.
     universal
         Whether every piezo has it: where records cannot tell it from others, it is named first.
     held
@@ -172,6 +177,7 @@ class AbstractEffect(AbstractPart):
     column: ClassVar[str] = ""
     statistic: ClassVar[Statistic] = ""
     independent: ClassVar[bool] = False
+    flexible: ClassVar[bool] = False
     universal: ClassVar[bool] = False
     held: ClassVar[str] = ""
     delay: ClassVar[str] = ""

@@ -59,6 +59,7 @@ class BoucWenHysteresis(AbstractEffect):
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("amplitude_um",)
     history: ClassVar[tuple[str, ...]] = ("before",)
+    flexible: ClassVar[bool] = True
     # There it is a play, which every density has.
     extremes: ClassVar[tuple[str, ...]] = ("exponent",)
     fingerprint: ClassVar[str] = (
