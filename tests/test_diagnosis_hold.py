@@ -1,5 +1,6 @@
 """Which way of a command between samples a diagnosis takes, by what lines and the other leave."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -92,6 +93,19 @@ def test_runs_of_one_rig_go_apart_only_where_that_is_more_than_a_small_part_of_t
     assert (PlainFit.better_holds(fit, THRESHOLDS) == ("zero", "first")) == mixed
 
 
+@dataclass(frozen=True)
+class Other:
+    """A fit with the command in another way."""
+
+    holds: tuple[str, ...]
+    left_beside_best: float
+    regression: None = None
+    faults: SimpleNamespace | None = None
+
+    def largest_z(self):
+        return 30.0
+
+
 @pytest.mark.parametrize(
     ("curves", "best_z", "kept"), [(22.31, 60.0, True), (22.31, 30.0, False), (22.6, 30.0, True), (10.0, 60.0, False)]
 )
@@ -101,6 +115,12 @@ def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(monk
     projector = SimpleNamespace(off=lambda joined: joined, residual=there)
     monkeypatch.setattr(_plain_fit, "Projector", lambda *_: SimpleNamespace(bounded=lambda: projector))
     nothing = {"left_beside_lag": lambda: np.inf, "left_beside_delay": lambda: np.inf}
-    fit = SimpleNamespace(left=lines, faults=SimpleNamespace(noise=None), largest_z=lambda: best_z, **nothing)
-    other = SimpleNamespace(regression=None, holds=("smooth",), largest_z=lambda: 30.0)
+    faults = SimpleNamespace(noise=None)
+    fit = SimpleNamespace(left=lines, faults=faults, largest_z=lambda: best_z, left_beside_best=1e5, **nothing)
+    other = Other(holds=("smooth",), left_beside_best=1e5)
     assert PlainFit.outdoes(fit, other) == kept
+    # An effect beside one of them leaves half of what is left beside any and the other, or not.
+    for less, more, far in ((11_000.0, 20_000.0, True), (16_000.0, 20_000.0, False), (9_000.0, 10_400.0, False)):
+        for here, there in ((less, more), (more, less)):
+            fit.left_beside_best, other = here, Other(holds=("smooth",), left_beside_best=there)
+            assert PlainFit.outdoes(fit, other) == (here < there if far else kept)

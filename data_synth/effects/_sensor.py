@@ -49,7 +49,7 @@ def mains_hum(reading_um: FloatArray, run: Situation, *, amplitude_um: float, ma
     "amplitude_um",
     usual=0.05,
     limit=2.0,
-    draws={"period_um": (0.15, 0.8)},
+    draws={"period_um": (1.0, 2.5)},
     between={"period_um": POSITIVE},
 )
 def cyclic_error(

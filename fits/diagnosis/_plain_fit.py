@@ -11,10 +11,10 @@ from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._joint_fit import alternate, fit_from_poles
 from fits.diagnosis._noise import Faults
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import refit
+from fits.diagnosis._refit import nothing, refit, refit_beside
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._residual_tests import repeats_in
-from fits.diagnosis._score import Probe, applicable, law_of, probes_of, scales_of, score
+from fits.diagnosis._score import Probe, Scored, applicable, law_of, probes_of, scales_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._threads import map_in_threads
 from microid import Hold
@@ -29,6 +29,8 @@ IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
 # What is left exceeds noise by no more than this part of it.
 _NOISE = 0.05
+# So many effects are fitted beside a way of the command, which one explains that leaves half of what others do.
+_TRIED, _HALF = 4, 0.5
 # A lag beside lines that is no more than steps leaves less of what is beyond noise by no more than this part.
 _PLAIN = 0.1
 
@@ -118,8 +120,8 @@ class PlainFit:
         Together they must explain more with the best effect beside them than those that were taken.
         """
         least, off = thresholds.other_hold_z**2, thresholds.model_error
-        taken = self.holds
-        whole = float(self.left @ self.left)
+        taken, noise = self.holds, len(self.left)
+        whole, best = float(self.left @ self.left), self.largest_z() ** 2
 
         def gained(holds: Holds) -> float:
             left = self.left_under(holds)
@@ -144,9 +146,10 @@ class PlainFit:
         if {*found} - {*taken} >= {"zero"}:
             without = tuple(_HOLDS[0] if hold == "zero" else hold for hold in found)
             late, more = delayed(without), gained(found) - gained(without)
-            if late <= least or not (more > (1 - off) * late or more + delayed(found) - late > off * late):
+            explained = late > least and (more > (1 - off) * late or more + delayed(found) - late > off * late)
+            # The stage may have taken up how late they are, in a way that leaves far more than steps do.
+            if not explained and not _is_far_less(whole - gained(found), whole - best, noise):
                 found = _climbed(worth, without, _HOLDS[:2])
-        best = self.largest_z() ** 2
 
         @cache
         def beside(holds: Holds) -> float:
@@ -161,7 +164,7 @@ class PlainFit:
             own = max(least, off * (whole - len(self.left)))
             return alike if by(alike) > by(holds) - own else holds
 
-        if "zero" in found and found != taken:
+        if any(way == "zero" != own for way, own in zip(found, taken, strict=True)):
             # What only a delay beside it would be worth may hide what needs none.
             ways = (way for way in (found, most(alone)) if gained(way) > least and beside(way) > (1 - off) * best)
             return shared(next(ways, taken))
@@ -173,7 +176,8 @@ class PlainFit:
             changed = (tuple(way if k in which else hold for k, hold in enumerate(taken)) for which in each)
             return [holds for holds in changed if holds != taken]
 
-        curves = [holds for holds in (found, *instead(_HOLDS[1])) if holds != taken]
+        # Levels looked like steps, and may have been lines.
+        curves = [holds for holds in (found, *instead(_HOLDS[1]), *instead(_HOLDS[0])) if holds != taken]
         # Steps that leave less without any effect explain what a delay does.
         late = delayed(taken)
         as_delay = (1 - off) * late if late > least else np.inf
@@ -222,12 +226,30 @@ class PlainFit:
         model = refit(self.bench, self.projector, [law], [law.start])
         return alternate(self.bench, self.projector, model)[-1].cost
 
+    @cached_property
+    def left_beside_best(self) -> float:
+        """Sum of squares beside the best of some effects, fitted with the stage; no lags, as steps resemble these."""
+        nothing_yet = nothing(self.bench, self.projector)
+        probes = [probe for probe in self.probed[0] if not (probe.form.delay or probe.form.lag)]
+        best: dict[type[AbstractEffect], Scored] = {}
+        for one in sorted(score(self.projector, probes, self.left).each, key=lambda one: -one.z):
+            best.setdefault(one.form, one)
+        found = [refit_beside(self.bench, self.projector, nothing_yet, one) for one in [*best.values()][:_TRIED]]
+        if not found:
+            return np.inf
+        model = min(found, key=lambda one: one.cost)
+        return min(model.cost, alternate(self.bench, self.projector, model)[-1].cost)
+
     def outdoes(self, other: "PlainFit") -> bool:
         """Whether a lag of the reading leaves less here than another fit does with the best effect beside it.
 
         Curves need no effect, or leave less by far beside one, or lines are kept. Steps are much like lines behind a
-        delay: that is not asked then.
+        delay: that is not asked then. First it is asked whether an effect leaves far less beside one of them than any
+        does beside the other.
         """
+        near, far = self.left_beside_best, replace(other, faults=self.faults).left_beside_best
+        if _is_far_less(min(near, far), max(near, far), len(self.left)):
+            return near < far
         there = Projector(other.regression, self.faults.noise).bounded()
         left = there.off(there.residual)
         whole = float(left @ left)
@@ -244,6 +266,11 @@ class PlainFit:
             return True
         beside = min(self.left_beside_lag(), self.left_beside_delay())
         return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)
+
+
+def _is_far_less(cost: float, other: float, noise: int) -> bool:
+    """Whether one sum of squares is far less beyond noise than another, which is beyond it."""
+    return cost - noise < _HALF * (other - noise) and other > (1 + _NOISE) * noise
 
 
 def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLDS) -> Holds:
