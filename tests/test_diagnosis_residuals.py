@@ -218,6 +218,8 @@ def test_faults_have_the_variance_that_they_make(rng):
     # Within four widths, which are of 2 Hz.
     own = [faults(band=wave).rings_itself(at_Hz, THRESHOLDS) for at_Hz in (None, 11.0, 13.0, 27.0, 29.0)]
     assert own == [False, False, True, True, False]
+    none = Band(0.0, 0.0, 0.0, 0.0, 0.0)
+    assert not faults(band=none).rings_itself(100.0, THRESHOLDS)
     for other in (replace(wave, frequency_Hz=50.0), replace(wave, quality=1.0), replace(wave, z=3.0)):
         assert name_faults(faults(band=other), False) == []
 

@@ -2,13 +2,17 @@
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_diagnosis_decisions import misfit
 
+from fits import Record
 from fits.diagnosis import _misfit
+from fits.diagnosis._comparison import has_occurred, model_error
 from fits.diagnosis._explanation import Cause, Selection
 from fits.diagnosis._thresholds import Thresholds
+from microid.effects.dropped_samples import DroppedSamples
 
 
 def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), weak=()):
@@ -87,3 +91,23 @@ def test_what_is_weak_and_small_is_named_beside_others_only_where_it_predicts(mo
     assert named_beside(monkeypatch, parts, chance, weak=weak, helpful=weak) == [*parts]
     # What is as large as a third of the noise need not.
     assert named_beside(monkeypatch, {**parts, "thermal_drift": 1000.0}, chance, weak=weak) == [*parts]
+
+
+@pytest.mark.parametrize(
+    ("lost_samples", "after_s", "occurred"),
+    [(1.0, 5.0, True), (0.3, 5.0, False), (1.0, 0.05, False), (1.4, 0.4, True)],
+)
+def test_a_loss_is_of_whole_samples_and_lies_inside_its_run(samples, after_s, occurred):
+    interval_s, n = 0.01, 1001
+    time_s = interval_s * np.arange(n)
+    loss = DroppedSamples(jnp.asarray(samples * interval_s), jnp.asarray(after_s))
+    record = Record(time_s, np.sin(time_s), np.sin(time_s))
+    bench = SimpleNamespace(prepared=[SimpleNamespace(run=SimpleNamespace(record=record))])
+    law = SimpleNamespace(form=DroppedSamples, effect=lambda x, run: loss)
+    assert has_occurred(bench, SimpleNamespace(laws=[law], x=[None])) == occurred
+
+
+def test_a_hysteresis_that_bends_to_anything_needs_the_evidence_of_what_it_is_mistaken_for():
+    thresholds = Thresholds()
+    assert model_error("bouc_wen_hysteresis", ["creep"], thresholds) == thresholds.confused_error
+    assert model_error("backlash", ["creep"], thresholds) == thresholds.model_error

@@ -60,7 +60,7 @@ class Faults:
 
     def rings_itself(self, resonance_Hz: float | None, thresholds: Thresholds) -> bool:
         """Whether the band is at the stage's resonance, which rings after all that a model lacks."""
-        if resonance_Hz is None:
+        if resonance_Hz is None or self.band.quality == 0:
             return False
         width_Hz = self.band.frequency_Hz / self.band.quality
         return abs(self.band.frequency_Hz - resonance_Hz) < thresholds.apart_z * width_Hz
