@@ -247,12 +247,14 @@ class PlainFit:
         delay: that is not asked then. First it is asked whether an effect leaves far less beside one of them than any
         does beside the other.
         """
-        near, far = self.left_beside_best, replace(other, faults=self.faults).left_beside_best
-        if _is_far_less(min(near, far), max(near, far), len(self.left)):
-            return near < far
         there = Projector(other.regression, self.faults.noise).bounded()
         left = there.off(there.residual)
-        whole = float(left @ left)
+        whole, here = float(left @ left), float(self.left @ self.left)
+        # Where either leaves noise alone, that is not asked.
+        if min(here, whole) > (1 + _NOISE) * len(left):
+            near, far = self.left_beside_best, replace(other, faults=self.faults).left_beside_best
+            if _is_far_less(min(near, far), max(near, far), len(left)):
+                return near < far
         rest = whole - other.largest_z() ** 2
         # Of noise alone nothing would leave less.
         if rest <= (1 + _NOISE) * len(left):
@@ -261,7 +263,6 @@ class PlainFit:
             # They need no parameter.
             return self.left_beside_lag() < rest - _PLAIN * (rest - len(left))
         # Of what is more than noise either way, a small part decides nothing, unless the best effect explains less.
-        here = float(self.left @ self.left)
         if here - whole < min(_NOISE * (here - len(left)), self.largest_z() ** 2):
             return True
         beside = min(self.left_beside_lag(), self.left_beside_delay())

@@ -38,7 +38,7 @@ class CyclicError(AbstractEffect):
     strength: ClassVar[tuple[str, ...]] = ("cosine_um", "sine_um")
     phases: ClassVar[tuple[str, ...]] = ("cosine_um", "sine_um")
     fingerprint: ClassVar[str] = (
-        "The residual repeats itself in every period of the position, of some 0.1 to 1 um, at any rate and both ways."
+        "The residual repeats itself in every period of the position, at any rate and both ways."
     )
     confusions: ClassVar[tuple[str, ...]] = ("floor_vibration", "timestamp_jitter")
     experiment: ClassVar[str] = "A slow ramp over some periods, up and down, from two offsets of the sensor."
