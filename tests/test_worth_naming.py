@@ -94,7 +94,7 @@ def test_what_is_weak_and_small_is_named_beside_others_only_where_it_predicts(mo
 
 
 @pytest.mark.parametrize(
-    ("lost_samples", "after_s", "occurred"),
+    ("samples", "after_s", "occurred"),
     [(1.0, 5.0, True), (0.3, 5.0, False), (1.0, 0.05, False), (1.4, 0.4, True)],
 )
 def test_a_loss_is_of_whole_samples_and_lies_inside_its_run(samples, after_s, occurred):
