@@ -48,6 +48,48 @@ def test_without_a_delay_there_are_no_steps():
     assert not prefers("zero", lines=9000, other=5000, late=20)
 
 
+def test_steps_that_leave_far_less_than_any_effect_need_no_delay():
+    """The stage had taken up how late they were: lines left 98,786, and 29,098 beside the best effect."""
+    assert prefers("zero", lines=98786, other=12113, late=0.0, best=69688, best_after=3581)
+    assert not prefers("zero", lines=98786, other=12113, late=0.0, best=86000, best_after=3581)
+
+
+def better_holds(taken, table):
+    """The ways that are taken where, of 10,000 samples, each of two runs' leaves some, a delay and an effect of that.
+
+    What a delay and the best effect take off is given beside the cost, by what leaves it.
+    """
+    left = {holds: np.full(10_000, cost**0.5 / 100) for holds, (cost, _, _) in table.items()}
+    known = {id(left[holds]): row for holds, row in table.items()}
+    fit = SimpleNamespace(
+        holds=taken,
+        left=left[taken],
+        left_under=lambda holds: left.get(holds, np.full(10_000, 1e3)),
+        delay_drop=lambda at: known.get(id(at), (0, 0.0, 0.0))[1],
+        largest_z=lambda at=left[taken]: known.get(id(at), (0, 0.0, 0.0))[2] ** 0.5,
+    )
+    return PlainFit.better_holds(fit, THRESHOLDS)
+
+
+def test_levels_that_looked_like_steps_may_be_lines_beside_an_effect():
+    """A driver's slew limit: lines leave a little more, and far less beside it."""
+    table = {("first", "zero"): (28000.0, 0.0, 4800.0), ("first", "first"): (28800.0, 0.0, 11800.0)}
+    assert better_holds(("first", "zero"), table) == ("first", "first")
+    table["first", "first"] = 28800.0, 0.0, 5000.0
+    assert better_holds(("first", "zero"), table) == ("first", "zero")
+
+
+def test_a_delay_beside_lines_does_not_hide_steps_that_need_none():
+    """Beside hum, lines and a delay of the readings were worth more than steps, and worse beside the hum."""
+    table = {
+        ("first", "zero"): (304000.0, 0.0, 286300.0),
+        ("first", "first"): (314300.0, 14300.0, 275900.0),
+        ("zero", "first"): (314200.0, 14700.0, 275900.0),
+        ("zero", "zero"): (302700.0, 0.0, 286200.0),
+    }
+    assert better_holds(("first", "zero"), table) == ("zero", "zero")
+
+
 def test_curves_that_explain_what_an_effect_does_need_none():
     assert prefers("smooth", lines=9400, other=9010, late=0.0, best=400, best_after=10)
     assert prefers("smooth", lines=13801, other=13541, late=293, best=541, best_after=281)

@@ -7,12 +7,15 @@ from _models import random_model
 from scipy.interpolate import BSpline
 from scipy.signal import lsim
 
+import data_synth
+import fits
 import microid as m
 from fits import Record
-from fits.diagnosis._baseline import has_known_loop
+from fits.diagnosis._baseline import fit_baseline, has_known_loop
 from fits.loop._past import past_columns, rough_past_columns
-from fits.loop._run import prepare_run
+from fits.loop._run import known_samples, prepare_run
 from fits.stage._run import nuisance_columns
+from fits.stats._noise import stretches
 
 LEVELS = 120
 
@@ -186,3 +189,20 @@ def test_a_run_that_begins_near_its_highest_is_fitted_as_far_as_it_goes():
     run = prepare_run(Record(time_s, voltage, voltage), (0.0, 1.0), "unknown", 0.2, estimated=True)
     beyond = max(voltage[run.held_out].max(initial=0.0) - voltage[run.fitted].max(), 0.0)
     assert beyond <= 0.02 * (voltage.max() - voltage[0])
+
+
+def test_a_run_held_out_whose_past_is_unknown_to_its_end_ends_nothing(tmp_path):
+    """It stays between a quarter and three quarters of the range, and goes farthest at its last sample."""
+    data_synth.write(data_synth.hidden((), seed=7, slow_samples=1000, fast_samples=1500), tmp_path)
+    slow, fast = (fits.read_csv(tmp_path / f"{name}.csv") for name in ("slow", "fast"))
+    inside = (
+        np.abs(slow.voltage_V - np.mean([slow.voltage_V.min(), slow.voltage_V.max()])) < np.ptp(slow.voltage_V) / 4
+    )
+    first, stop = max(stretches(inside), key=lambda one: one[1] - one[0])
+    part = {"time_s": slow.time_s[first:stop], "voltage_V": slow.voltage_V[first:stop]}
+    third = Record(**part, displacement_um=slow.displacement_um[first:stop], source="third.csv")
+    assert known_samples(third.voltage_V, slow.voltage_V.min(), slow.voltage_V.max()).sum() < 50
+    baseline = fit_baseline([slow, fast], [third], 0.0, "unknown", lambda _: None)
+    (aside,) = baseline.aside
+    assert aside.known.all()
+    assert aside.hold == baseline.stage.hold

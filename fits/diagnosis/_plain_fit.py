@@ -116,8 +116,9 @@ class PlainFit:
     def better_holds(self, thresholds: Thresholds) -> Holds:
         """How the command of each run goes between samples, as it was taken unless there is evidence for another way.
 
-        Curves must leave less than lines beyond chance. Steps must explain what a delay behind the others does.
-        Together they must explain more with the best effect beside them than those that were taken.
+        Curves must leave less than lines beyond chance. Steps must explain what a delay behind the others does, or
+        leave far less than any effect beside the others. Together they must explain more with the best effect beside
+        them than those that were taken.
         """
         least, off = thresholds.other_hold_z**2, thresholds.model_error
         taken, noise = self.holds, len(self.left)
