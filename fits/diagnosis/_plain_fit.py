@@ -41,6 +41,7 @@ class PlainFit:
 
     regression: Regression
     faults: Faults
+    thresholds: Thresholds = THRESHOLDS
 
     @property
     def holds(self) -> Holds:
@@ -58,7 +59,7 @@ class PlainFit:
     @cached_property
     def scales(self) -> Scales:
         repeated = repeats_in(self.projector, self.left, self.bench.plain)
-        period_um = repeated.period_um if repeated.z > THRESHOLDS.cycles else None
+        period_um = repeated.period_um if repeated.z > self.thresholds.cycles else None
         return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise), period_um)
 
     @cached_property

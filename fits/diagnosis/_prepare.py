@@ -107,11 +107,12 @@ def prepare_diagnosis(
         regression = regress(fit_baseline(records, *settings, onward))
         faults = find_faults(regression, None, reading.thresholds)
         if not faults.repaired:
-            return PlainFit(regression, faults)
+            return PlainFit(regression, faults, reading.thresholds)
         progress("fitting the plain stage again, without single bad samples")
         regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem))
         found = find_faults(regression, None, reading.thresholds)
-        return PlainFit(regression, replace(found, spikes=faults.spikes, heights_um=faults.heights_um))
+        found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
+        return PlainFit(regression, found, reading.thresholds)
 
     progress(Step.BASELINE)
     here = fitted(tuple(map(_hold_of_plateaus, records)))
@@ -150,10 +151,10 @@ def prepare_diagnosis(
             drop > max(reading.thresholds.other_hold_z**2, (_ABOUT * here.largest_z()) ** 2)
             and late_s < _SKEW * here.scales.interval_s
         ):
-            here = PlainFit(regress(replace(here.regression.baseline, skewed=True)), here.faults)
+            here = replace(here, regression=regress(replace(here.regression.baseline, skewed=True)))
             said = (*said, _SKEWED.format(late_s))
     if here.faults.jitter_s > 0:
-        here = PlainFit(regress(replace(here.regression.baseline, blurred=True)), here.faults)
+        here = replace(here, regression=regress(replace(here.regression.baseline, blurred=True)))
     regression, bench, faults, (probes, skipped) = here.regression, here.bench, here.faults, here.probed
     if all(held_gain([record]) is not None for record in records):
         shut = dict.fromkeys(one.name for one in probes if not one.form.held)
