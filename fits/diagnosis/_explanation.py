@@ -13,6 +13,7 @@ from fits.diagnosis._refit import Refit
 from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import Thresholds
 from fits.stats._compare import is_worse
+from microid.effects import card_of
 
 # The farthest that a standard deviation in coordinates is taken at its word.
 _FARTHEST = 3.0
@@ -114,6 +115,11 @@ class Explanation:
         """Of the causes, in the order in which they were found, each once."""
         return tuple(dict.fromkeys(cause.name for cause in self.causes))
 
+    def modelled(self, plain: Refit) -> float:
+        """Decrease of the sum of squares by causes that others may be mistaken for, as their models are not exact."""
+        independent = sum(cause.drop for cause in self.causes if card_of(cause.name).independent)
+        return max(plain.cost - self.model.cost - independent, 0.0)
+
     @property
     def near_bound(self) -> bool:
         """Whether a cause may, within a standard deviation, be as large as such an effect can be."""
@@ -131,7 +137,7 @@ def best_of_ends(ends: Sequence[Explanation], plain: Refit, thresholds: Threshol
     """
     ends = [one for one in ends if not any(_adds_little(one, other, plain, thresholds) for other in ends)]
     first = min(ends, key=lambda one: one.criterion)
-    most = first.criterion + confusable_z(plain.cost - first.model.cost, thresholds) ** 2
+    most = first.criterion + confusable_z(first.modelled(plain), thresholds) ** 2
     near = [one for one in ends if one.criterion <= most]
 
     def is_outdone(one: Explanation) -> bool:
@@ -149,8 +155,7 @@ def _adds_little(one: Explanation, other: Explanation, plain: Refit, thresholds:
     further = set(one.names) - set(other.names)
     alike = {*other.names}.union(*(cause.behind for cause in other.causes))
     off = max(model_error(name, alike, thresholds) for name in further)
-    explained, gained = plain.cost - other.model.cost, other.model.cost - one.model.cost
-    return gained <= off**2 * max(explained, 0.0)
+    return other.model.cost - one.model.cost <= off**2 * other.modelled(plain)
 
 
 def with_equals(best: Explanation, ends: Sequence[Explanation], thresholds: Thresholds, plain: Refit) -> Explanation:
@@ -158,7 +163,7 @@ def with_equals(best: Explanation, ends: Sequence[Explanation], thresholds: Thre
 
     Those that explain less there, whatever was put beside them, are none of them.
     """
-    least = best.criterion + confusable_z(plain.cost - best.model.cost, thresholds) ** 2
+    least = best.criterion + confusable_z(best.modelled(plain), thresholds) ** 2
     causes = []
     for at, cause in enumerate(best.causes):
         before = {other.name for other in best.causes[:at]}

@@ -74,7 +74,7 @@ def select(
                 found = select(bench, afresh, *settings, again - 1)
                 if found.causes and is_smoothness_confirmed(found.projector, found.model):
                     return found
-        reach = confusable_z(plain.cost - order[0].model.cost, thresholds) ** 2 if order else 0.0
+        reach = confusable_z(order[0].modelled(plain), thresholds) ** 2 if order else 0.0
         # The same that is near is worth following where it is with the best further cause, which another may hide.
         most = min((one.promise for one in order), default=0.0) + reach
         near = [one for one in ranked if one[1].criterion < order[0].criterion + reach or one[1].promise < most]
@@ -96,8 +96,7 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
     # another of its class explains more, like what that one is mistaken for.
     alike = taken.union(*(cause.behind for cause in one.causes))
     whole = max(search.plain.cost - model.cost, 0.0)
-    independent = sum(cause.drop for cause in one.causes if card_of(cause.name).independent)
-    explained = max(whole - independent, 0.0) ** 0.5
+    explained = one.modelled(search.plain) ** 0.5
     bars = {
         scored.form: (whole**0.5 if scored.form.independent else explained)
         * model_error(scored.name, alike, thresholds)
