@@ -20,9 +20,10 @@ from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._motion import at_samples, prepare, signals
+from fits.stage._run import named_parts
 from fits.stage._solve import Problem, prior_precision
 from fits.stats._noise import rough_noise_um
-from microid import Hold, Mechanics, Stage
+from microid import Driver, Hold, Mechanics, Preisach, Stage
 from microid.effects import AbstractEffect, extend, host
 
 # A voltage has been at an end once it comes this close, as a part of the range.
@@ -34,6 +35,8 @@ _COARSE = 4
 # Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
 # all samples together, in noise.
 _FINE, _LARGEST_DIFFERENCE = 16, 1.0
+# Begins a remark that goes on to say why.
+STATIC = "driver and mechanics are left out, the stage is taken as quasi-static: "
 
 
 class Fixed(eqx.Module):
@@ -96,6 +99,13 @@ class Baseline:
         """The same at other coordinates and columns."""
         return replace(self, z=self.z + dz, columns_um=self.columns_um + dcolumns_um)
 
+    def with_driver_alone(self, lag_s: float) -> Problem:
+        """Its hysteresis behind a driver that lags so, and no mechanics: where a fit of that begins."""
+        [(name, hysteresis)] = named_parts(self.stage, Preisach)
+        driver = Driver(jnp.asarray(lag_s))
+        stage = Stage((driver, hysteresis), ("driver", name), hold=self.stage.hold).freeze("driver.gain")
+        return Problem.of(stage, self.chain.grid, self.columns_um, self.hyper, self.stroke_um)
+
     def alone(self, run: Run) -> "Baseline":
         """The same with one run only; what is known of the columns beforehand counts with the others."""
         made, none = (run,), ()
@@ -157,7 +167,7 @@ def fit_baseline(
     except (DataError, FitError) as error:
         # That is what is done.
         why = str(error).removesuffix(BESIDE_A_LAG).removesuffix(f", {OR_ALONE}")
-        remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {why}",)
+        remarks = (STATIC + why,)
         return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
     solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
     prior = prior_precision(chain, solved.hyper, stroke_um)

@@ -72,6 +72,12 @@ class PlainFit:
         """What the stage leaves, whitened and joined."""
         return self.projector.off(self.projector.residual)
 
+    def in_noise_of(self, other: "PlainFit") -> "PlainFit":
+        """The same beside the noise of another fit; effects are not simulated again."""
+        found = replace(self, faults=other.faults)
+        found.__dict__.update(bench=self.bench, scales=self.scales, probed=self.probed, _delays=self._delays)
+        return found
+
     @cached_property
     def _delays(self) -> list[Probe]:
         form = next(form for form in EFFECTS if form.delay)
@@ -150,7 +156,7 @@ class PlainFit:
             late, more = delayed(without), gained(found) - gained(without)
             explained = late > least and (more > (1 - off) * late or more + delayed(found) - late > off * late)
             # The stage may have taken up how late they are, in a way that leaves far more than steps do.
-            if not explained and not _is_far_less(whole - gained(found), whole - best, noise):
+            if not explained and not is_far_less(whole - gained(found), whole - best, noise):
                 found = _climbed(worth, without, _HOLDS[:2])
 
         @cache
@@ -254,8 +260,8 @@ class PlainFit:
         whole, here = float(left @ left), float(self.left @ self.left)
         # Where either leaves noise alone, that is not asked.
         if min(here, whole) > (1 + _NOISE) * len(left):
-            near, far = self.left_beside_best, replace(other, faults=self.faults).left_beside_best
-            if _is_far_less(min(near, far), max(near, far), len(left)):
+            near, far = self.left_beside_best, other.in_noise_of(self).left_beside_best
+            if is_far_less(min(near, far), max(near, far), len(left)):
                 return near < far
         rest = whole - other.largest_z() ** 2
         # Of noise alone nothing would leave less.
@@ -271,7 +277,7 @@ class PlainFit:
         return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)
 
 
-def _is_far_less(cost: float, other: float, noise: int) -> bool:
+def is_far_less(cost: float, other: float, noise: int) -> bool:
     """Whether one sum of squares is far less beyond noise than another, which is beyond it."""
     return cost - noise < _HALF * (other - noise) and other > (1 + _NOISE) * noise
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline, fit_baseline
+from fits.diagnosis._baseline import STATIC, Baseline, fit_baseline
 from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
 from fits.diagnosis._effects import Bench, drop_programs
+from fits.diagnosis._lag_place import is_of_driver, lag_of, may_be_of_driver
 from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._plain_fit import IN_LINES, IN_STEPS, Holds, PlainFit
 from fits.diagnosis._projector import Projector
@@ -16,9 +17,10 @@ from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
+from fits.stage._run import named_parts
 from fits.stage._solve import Problem
 from fits.stats._held import held_gain
-from microid import Hold
+from microid import Driver, Hold
 
 # A delay below this part of the sampling interval is no effect, but one of each run's own.
 _SKEW = 0.04
@@ -28,6 +30,8 @@ _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
+_DAMPED = "a mode that does not ring in these runs leaves more than a lag of the readings beside that"
+_DRIVER = "the stage has a driver, which lags by {:.3g} s, and no mechanics: {}"
 _STEPS = (
     "the command{} is taken to be held between samples, as a converter does: behind lines the readings would be late "
     "by half a sample, and a delay of that length would look the same"
@@ -114,11 +118,28 @@ def prepare_diagnosis(
         found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
         return PlainFit(regression, found, reading.thresholds)
 
+    def lagging(here: PlainFit, holds: Holds, said: tuple[str, ...]) -> tuple[PlainFit, tuple[str, ...]]:
+        """A stage with a driver and no mechanics in place of another, where that explains more."""
+        if not (may_be_of_driver(here, reading.thresholds) and has_time()):
+            return here, said
+        progress("fitting the plain stage again, with a driver and no mechanics")
+        drop_programs(records)
+        other = fitted(holds, here.regression.baseline.with_driver_alone(lag_of(here)))
+        if not is_of_driver(other, here, reading.thresholds):
+            return here, said
+        [(_, driver)] = named_parts(other.regression.baseline.stage, Driver)
+        why = [one.removeprefix(STATIC) for one in here.regression.baseline.remarks] or [_DAMPED]
+        return other, (*said, _DRIVER.format(float(driver.time_constant_s), why[0]))
+
     progress(Step.BASELINE)
-    here = fitted(tuple(map(_hold_of_plateaus, records)))
+    holds = tuple(map(_hold_of_plateaus, records))
+    here = fitted(holds)
     drop_programs(records)
     progress(Step.PROBES)
+    if not here.regression.baseline.dynamic:
+        here, said = lagging(here, holds, said)
     if here.regression.baseline.dynamic:
+        rings = here.regression.baseline.resonance_Hz is not None
         holds = here.better_holds(reading.thresholds)
         steps = holds == here.holds and here.may_step(reading.thresholds)
         if (steps or holds != here.holds) and not has_time():
@@ -127,7 +148,7 @@ def prepare_diagnosis(
             progress("fitting the plain stage again, its command in another way between samples")
             drop_programs(records)
             if steps:
-                other = fitted(IN_STEPS * len(records))
+                other = fitted(IN_STEPS * len(records), None if rings else here.regression.baseline.problem)
                 here = other if other.leaves_less(here) else here
             else:
                 other = fitted(holds, here.regression.baseline.problem)
@@ -144,6 +165,8 @@ def prepare_diagnosis(
                 other = fitted(own, here.regression.baseline.problem)
                 here = other if other.leaves_less(here, False) else here
             drop_programs(records)
+        if rings:
+            here, said = lagging(here, here.holds, said)
         said = (*said, *_of_holds(here.regression.baseline))
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()

@@ -1,0 +1,92 @@
+"""Where a lag lies that runs show without a resonance: in the driver, ahead of the hysteresis, or behind it."""
+
+from functools import partial
+
+import numpy as np
+
+from fits.diagnosis._joint_fit import alternate
+from fits.diagnosis._plain_fit import PlainFit, is_far_less
+from fits.diagnosis._refit import Refit, nothing, refit_beside
+from fits.diagnosis._score import Scored, score
+from fits.diagnosis._thresholds import Thresholds
+from fits.io._threads import map_in_threads
+from fits.stage._run import named_parts
+from microid import Driver, Mechanics
+
+# A resonance that is damped less rings, and is not mistaken for a delay.
+_RINGS = 0.2
+# What is left exceeds noise by no more than this part of it.
+_NOISE = 0.05
+# So many effects beside a lag are fitted.
+_TRIED = 2
+
+
+def may_be_of_driver(plain: PlainFit, thresholds: Thresholds) -> bool:
+    """Whether a driver alone may explain what a stage does not, or explains by a mode that never rings."""
+    baseline = plain.regression.baseline
+    if not baseline.dynamic:
+        return plain.delay_drop(plain.left) > thresholds.other_hold_z**2
+    damped = [float(part.damping_ratio) > _RINGS for _, part in named_parts(baseline.stage, Mechanics)]
+    return any(damped) and float(plain.left @ plain.left) > (1 + _NOISE) * len(plain.left)
+
+
+def lag_of(plain: PlainFit) -> float:
+    """How late the readings are, in s: as its driver and mechanics have it, or as a delay shows them."""
+    parts = [part for _, part in named_parts(plain.regression.baseline.stage, Driver, Mechanics)]
+    if not parts:
+        return plain.late()[1]
+    return float(sum(np.sum(-1 / part.poles_rad_per_s).real for part in parts))
+
+
+def is_of_driver(driver: PlainFit, plain: PlainFit, thresholds: Thresholds) -> bool:
+    """Whether a stage with a driver and no mechanics is to be taken in place of the plain one.
+
+    Every stage has a driver: one that leaves noise alone needs no other lag. It lags ahead of the hysteresis, and a
+    sensor behind it, so that loops turn otherwise: beside a quasi-static stage a lag of the reading must leave less,
+    by more than models are off by. A mode that never rings may stand in for a delay: where a driver beside one, and
+    beside what else explains most, leaves far less than that mode alone, and no more than the mode beside the same,
+    the mode is not needed.
+    """
+    if not driver.regression.baseline.dynamic:
+        return False
+    if plain.regression.baseline.dynamic:
+        beside, noise = _left_beside_two(driver.in_noise_of(plain)), len(plain.left)
+        if not is_far_less(beside, float(plain.left @ plain.left), noise):
+            return False
+        other = _left_beside_two(plain)
+        return beside < other + max(thresholds.other_hold_z**2, thresholds.model_error * (other - noise))
+    left, noise = float(driver.left @ driver.left), len(driver.left)
+    if left <= (1 + _NOISE) * noise:
+        return True
+    there = plain.in_noise_of(driver)
+    lags = _beside_lags(there)
+    beside = min((alternate(there.bench, there.projector, lag)[-1].cost for lag in lags), default=left)
+    return left < beside + max(thresholds.other_hold_z**2, thresholds.model_error * (beside - noise))
+
+
+def _beside_lags(plain: PlainFit) -> list[Refit]:
+    """Fits of a lag and of a delay of the reading, those that the runs show."""
+    model = nothing(plain.bench, plain.projector)
+    scores = score(plain.projector, [one for one in plain.probed[0] if one.form.lag or one.form.delay], plain.left)
+    best = _best(scores.each)
+    return map_in_threads(partial(refit_beside, plain.bench, plain.projector, model), best) if best else []
+
+
+def _left_beside_two(plain: PlainFit) -> float:
+    """Sum of squares beside a lag of the reading, if there is one, and the best other effect."""
+    models = [nothing(plain.bench, plain.projector), *_beside_lags(plain)]
+    model = min(models, key=lambda one: one.cost)
+    others = [one for one in plain.probed[0] if not (one.form.lag or one.form.delay)]
+    best = _best(score(plain.projector, others, model.residual, model.basis()).each)[:_TRIED]
+    beside = map_in_threads(partial(refit_beside, plain.bench, plain.projector, model), best) if best else []
+    found = min((model, *beside), key=lambda one: one.cost)
+    return min(found.cost, alternate(plain.bench, plain.projector, found)[-1].cost)
+
+
+def _best(scores: tuple[Scored, ...]) -> list[Scored]:
+    """The best of each form, the first first."""
+    found: dict[type, Scored] = {}
+    for one in sorted(scores, key=lambda one: -one.z):
+        if one.z > 0:
+            found.setdefault(one.form, one)
+    return [*found.values()]
