@@ -147,6 +147,9 @@ class Other:
     def largest_z(self):
         return 30.0
 
+    def in_noise_of(self, _):
+        return self
+
 
 @pytest.mark.parametrize(
     ("curves", "best_z", "kept"), [(22.31, 60.0, True), (22.31, 30.0, False), (22.6, 30.0, True), (10.0, 60.0, False)]

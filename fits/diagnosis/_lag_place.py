@@ -15,6 +15,8 @@ from microid import Driver, Mechanics
 
 # A resonance that is damped less rings, and is not mistaken for a delay.
 _RINGS = 0.2
+# Most of what is left beyond noise is late.
+_MOSTLY = 0.5
 # What is left exceeds noise by no more than this part of it.
 _NOISE = 0.05
 # So many effects beside a lag are fitted.
@@ -23,11 +25,11 @@ _TRIED = 2
 
 def may_be_of_driver(plain: PlainFit, thresholds: Thresholds) -> bool:
     """Whether a driver alone may explain what a stage does not, or explains by a mode that never rings."""
-    baseline = plain.regression.baseline
-    if not baseline.dynamic:
-        return plain.delay_drop(plain.left) > thresholds.other_hold_z**2
-    damped = [float(part.damping_ratio) > _RINGS for _, part in named_parts(baseline.stage, Mechanics)]
-    return any(damped) and float(plain.left @ plain.left) > (1 + _NOISE) * len(plain.left)
+    late, left = plain.delay_drop(plain.left), float(plain.left @ plain.left)
+    if not plain.regression.baseline.dynamic:
+        return late > thresholds.other_hold_z**2
+    noise = len(plain.left)
+    return left > (1 + _NOISE) * noise and (_is_damped(plain) or late > _MOSTLY * (left - noise))
 
 
 def lag_of(plain: PlainFit) -> float:
@@ -50,8 +52,11 @@ def is_of_driver(driver: PlainFit, plain: PlainFit, thresholds: Thresholds) -> b
     if not driver.regression.baseline.dynamic:
         return False
     if plain.regression.baseline.dynamic:
-        beside, noise = _left_beside_two(driver.in_noise_of(plain)), len(plain.left)
-        if not is_far_less(beside, float(plain.left @ plain.left), noise):
+        alone, left, noise = driver.in_noise_of(plain), float(plain.left @ plain.left), len(plain.left)
+        if is_far_less(float(alone.left @ alone.left), left, noise):
+            return True
+        beside = _left_beside_two(alone) if _is_damped(plain) else np.inf
+        if not is_far_less(beside, left, noise):
             return False
         other = _left_beside_two(plain)
         return beside < other + max(thresholds.other_hold_z**2, thresholds.model_error * (other - noise))
@@ -62,6 +67,12 @@ def is_of_driver(driver: PlainFit, plain: PlainFit, thresholds: Thresholds) -> b
     lags = _beside_lags(there)
     beside = min((alternate(there.bench, there.projector, lag)[-1].cost for lag in lags), default=left)
     return left < beside + max(thresholds.other_hold_z**2, thresholds.model_error * (beside - noise))
+
+
+def _is_damped(plain: PlainFit) -> bool:
+    """Whether a mode of the stage does not ring."""
+    modes = named_parts(plain.regression.baseline.stage, Mechanics)
+    return any(float(mode.damping_ratio) > _RINGS for _, mode in modes)
 
 
 def _beside_lags(plain: PlainFit) -> list[Refit]:
