@@ -23,7 +23,7 @@ from fits.diagnosis._extension import (
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._misfit import SHOWN, worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
-from fits.diagnosis._prepare import ONE_WAY, Prepared
+from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._residual_tests import (
     explain,
@@ -146,8 +146,11 @@ def conclude(
             f"{', '.join(sorted(bound))}: a parameter ended at the bound of what such an effect may have, so that "
             "something else that looks alike may be there instead"
         )
-    if not baseline.dynamic and any(card_of(cause.name).lag or card_of(cause.name).delay for cause in kept):
+    late = any(card_of(cause.name).lag or card_of(cause.name).delay for cause in kept)
+    if late and not baseline.dynamic and BEHIND not in remarks:
         remarks.append(_OWN_LAG)
+    if not late:
+        remarks = [one for one in remarks if one != BEHIND]
     remarks += _before_the_runs(model, thresholds.determined_z)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)

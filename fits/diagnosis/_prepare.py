@@ -30,6 +30,7 @@ _SKEWED = (
     "the readings are late by {:.2g} s, a small part of the sampling interval: no more than converters that take "
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
+BEHIND = "a lag of the driver, ahead of the hysteresis, leaves more of these runs than a lag of the readings does"
 _DAMPED = "a mode that does not ring in these runs leaves more than a lag of the readings beside that"
 _DRIVER = "the stage has a driver, which lags by {:.3g} s, and no mechanics: {}"
 _STEPS = (
@@ -126,7 +127,8 @@ def prepare_diagnosis(
         drop_programs(records)
         other = fitted(holds, here.regression.baseline.with_driver_alone(lag_of(here)))
         if not is_of_driver(other, here, reading.thresholds):
-            return here, said
+            behind = other.regression.baseline.dynamic and not here.regression.baseline.dynamic
+            return here, (*said, BEHIND) if behind else said
         [(_, driver)] = named_parts(other.regression.baseline.stage, Driver)
         why = [one.removeprefix(STATIC) for one in here.regression.baseline.remarks] or [_DAMPED]
         return other, (*said, _DRIVER.format(float(driver.time_constant_s), why[0]))
