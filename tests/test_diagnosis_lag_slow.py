@@ -56,7 +56,10 @@ class Left:
     def regression(self):
         return SimpleNamespace(baseline=SimpleNamespace(dynamic=self.dynamic))
 
-    bench = projector = None
+    bench = projector = faults = None
+
+    def left_in(self, _):
+        return self.left
 
     def in_noise_of(self, _):
         return self

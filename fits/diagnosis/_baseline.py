@@ -35,8 +35,6 @@ _COARSE = 4
 # Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
 # all samples together, in noise.
 _FINE, _LARGEST_DIFFERENCE = 16, 1.0
-# Begins a remark that goes on to say why.
-STATIC = "driver and mechanics are left out, the stage is taken as quasi-static: "
 
 
 class Fixed(eqx.Module):
@@ -167,7 +165,7 @@ def fit_baseline(
     except (DataError, FitError) as error:
         # That is what is done.
         why = str(error).removesuffix(BESIDE_A_LAG).removesuffix(f", {OR_ALONE}")
-        remarks = (STATIC + why,)
+        remarks = (f"driver and mechanics are left out, the stage is taken as quasi-static: {why}",)
         return _static(records, aside, range_V, holdout, initial, past, remarks, progress)
     solved, chain, stroke_um = found.solved, found.solved.problem.chain, found.solved.problem.stroke_um
     prior = prior_precision(chain, solved.hyper, stroke_um)

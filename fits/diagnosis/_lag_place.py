@@ -52,10 +52,10 @@ def is_of_driver(driver: PlainFit, plain: PlainFit, thresholds: Thresholds) -> b
     if not driver.regression.baseline.dynamic:
         return False
     if plain.regression.baseline.dynamic:
-        alone, left, noise = driver.in_noise_of(plain), float(plain.left @ plain.left), len(plain.left)
-        if is_far_less(float(alone.left @ alone.left), left, noise):
+        alone, left, noise = driver.left_in(plain.faults), float(plain.left @ plain.left), len(plain.left)
+        if is_far_less(float(alone @ alone), left, noise):
             return True
-        beside = _left_beside_two(alone) if _is_damped(plain) else np.inf
+        beside = _left_beside_two(driver.in_noise_of(plain)) if _is_damped(plain) else np.inf
         if not is_far_less(beside, left, noise):
             return False
         other = _left_beside_two(plain)

@@ -72,6 +72,11 @@ class PlainFit:
         """What the stage leaves, whitened and joined."""
         return self.projector.off(self.projector.residual)
 
+    def left_in(self, faults: Faults) -> np.ndarray:
+        """What the stage leaves, in the noise of others."""
+        there = Projector(self.regression, faults.noise).bounded()
+        return there.off(there.residual)
+
     def in_noise_of(self, other: "PlainFit") -> "PlainFit":
         """The same beside the noise of another fit; effects are not simulated again."""
         found = replace(self, faults=other.faults)
@@ -210,8 +215,7 @@ class PlainFit:
 
     def leaves_less(self, other: "PlainFit", beside: bool = True) -> bool:
         """Whether less is left here than another fit leaves, `beside` the best effect or without any."""
-        here = Projector(self.regression, other.faults.noise).bounded()
-        left = here.off(here.residual)
+        left = self.left_in(other.faults)
         explained = other.largest_z() ** 2 if beside else 0.0
         return float(left @ left) < float(other.left @ other.left) - explained
 

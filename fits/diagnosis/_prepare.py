@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits.diagnosis._baseline import STATIC, Baseline, fit_baseline
+from fits.diagnosis._baseline import Baseline, fit_baseline
 from fits.diagnosis._discrepancy import ROUGHEST, learn_roughness, with_discrepancy
 from fits.diagnosis._effects import Bench, drop_programs
 from fits.diagnosis._lag_place import is_of_driver, lag_of, may_be_of_driver
@@ -31,8 +31,10 @@ _SKEWED = (
     "turns, or steps of a simulation, are off by, so that each run may have a lag of its own"
 )
 BEHIND = "a lag of the driver, ahead of the hysteresis, leaves more of these runs than a lag of the readings does"
-_DAMPED = "a mode that does not ring in these runs leaves more than a lag of the readings beside that"
-_DRIVER = "the stage has a driver, which lags by {:.3g} s, and no mechanics: {}"
+_DRIVER = (
+    "the stage has a driver, which lags by {:.3g} s, and no mechanics, as these runs show a lag and no resonance; to "
+    "have that, add a run with steps, a chirp or a multisine that goes beyond it, sampled at 5 times its frequency"
+)
 _STEPS = (
     "the command{} is taken to be held between samples, as a converter does: behind lines the readings would be late "
     "by half a sample, and a delay of that length would look the same"
@@ -130,8 +132,7 @@ def prepare_diagnosis(
             behind = other.regression.baseline.dynamic and not here.regression.baseline.dynamic
             return here, (*said, BEHIND) if behind else said
         [(_, driver)] = named_parts(other.regression.baseline.stage, Driver)
-        why = [one.removeprefix(STATIC) for one in here.regression.baseline.remarks] or [_DAMPED]
-        return other, (*said, _DRIVER.format(float(driver.time_constant_s), why[0]))
+        return other, (*said, _DRIVER.format(float(driver.time_constant_s)))
 
     progress(Step.BASELINE)
     holds = tuple(map(_hold_of_plateaus, records))
