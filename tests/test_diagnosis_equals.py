@@ -1,5 +1,6 @@
 """Which sets of causes are followed, and what explains as much as a cause in the end: by made-up explanations."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -140,3 +141,17 @@ def test_of_what_is_not_told_apart_the_one_that_predicts_better_is_taken(monkeyp
     other = explanation(("mains_hum", "rate_dependence"), 20_000.0 - ahead, held=grown * held)
     found = best_of_ends([creep, other], SimpleNamespace(cost=50_000.0), THRESHOLDS)
     assert found is {"creep": creep, "rate": other}[best]
+
+
+@pytest.mark.parametrize(("first", "best"), [("mains_hum", "creep"), ("backlash", "drift")])
+def test_what_hum_explains_makes_no_others_equal(monkeypatch, first, best):
+    # Beside a hum of 800 standard deviations a drift that predicts better had counted as equal to the creep.
+    monkeypatch.setattr(Explanation, "near_bound", False)
+    held = np.random.default_rng(1).standard_normal(2400)
+    creep = explanation((first, "creep"), 20_000.0, 18_000.0, held=1.6 * held)
+    drift = explanation((first, "thermal_drift"), 22_500.0, 20_500.0, held=held)
+    creep, drift = (
+        replace(one, causes=(replace(one.causes[0], drop=6.7e5), one.causes[1])) for one in (creep, drift)
+    )
+    found = best_of_ends([creep, drift], SimpleNamespace(cost=692_000.0), THRESHOLDS)
+    assert found is {"creep": creep, "drift": drift}[best]
