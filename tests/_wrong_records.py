@@ -63,9 +63,9 @@ TRUTH = {
 }
 
 
-def bench(stroke_um=40.0, rig=0):
-    """Slow and fast records of a rig; each number is another one."""
-    seed = seed_of("bench") + rig
+def bench(stroke_um=40.0, rig=0, first=None):
+    """Slow and fast records of a rig; each number is another one, counted from a first seed."""
+    seed = (seed_of("bench") if first is None else first) + rig
     made = data_synth.simulate(data_synth.parse_scenario(SCENARIO.format(stroke=stroke_um)), seed)
     return [Record(r.time_s, r.voltage_V, r.displacement_um, source=f"{r.name}.csv") for r in made.records]
 

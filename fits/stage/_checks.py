@@ -118,8 +118,9 @@ def refuse_unidentifiable(
         noise = solved.weighing.noise_um
         loudest = int(np.argmax(noise))
         if noise[loudest] > 3.0 * min(noise):  # it moves in ways that its samples do not show
-            check_gains(stage, solved.runs, refuse=True)
             loud = solved.runs[loudest]
+            # What is sampled too slowly may well seem to move further, or less far.
+            moved = check_gains(stage, solved.runs, refuse=_resolved(loud))
             why, remedy = f"sampled at {loud.rate_Hz:.4g} Hz, which seems too slow for what moves in it", _FASTER
             if _resolved(loud):
                 why = "no lag and no resonance was found that explains what moves in it"
@@ -127,7 +128,7 @@ def refuse_unidentifiable(
             raise DataError(
                 f"{loud.record.source}: {why}: {noise[loudest]:.3g} um of it stay unexplained, "
                 f"{noise[loudest] / min(noise):.3g} times as much as of the quietest run; {remedy}, {OR_ALONE}"
-                f"{BESIDE_A_LAG}"
+                + "; ".join([BESIDE_A_LAG, *moved])
             )
         raise DataError(
             f"{sources}: no delay and no ringing is told from the hysteresis here, so these runs hold nothing "

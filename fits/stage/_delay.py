@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from fits.io._errors import DataError
 from fits.loop._design import columns_of
@@ -15,7 +16,7 @@ from fits.stage._columns import pieces
 from fits.stage._moments import along, linearise
 from fits.stage._run import hysteresis_of, nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, try_chain
-from fits.stage._start import best_shifts, measure_response, start_stages
+from fits.stage._start import MeasuredResponse, best_shifts, measure_response, start_stages
 from fits.stage._steps import Plan, hysteresis_alone
 from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
 from fits.stats._metrics import TWO_SIDED_95
@@ -25,6 +26,8 @@ from microid import Preisach, Stage
 _MOVED_SD = 0.5
 # The search for delays goes so many samples either way.
 _FARTHEST_SAMPLES = 64
+# The best delay of a response is narrowed in so many trials, so many of its steps to either side.
+_NARROWED, _BESIDE = 6, 4.0
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
 REMEDY = "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
@@ -230,30 +233,48 @@ def _scores(plan: Plan, solved: Solved, shifts: np.ndarray) -> list[Delay]:
 def _search(plan: Plan, solved: Solved, far: Sequence[int]) -> tuple[np.ndarray, Problem] | None:
     """Large delays of the runs that are far from noise: shifts, and what to go on from; None where none helps."""
     # As it began: a delay bends the hysteresis of a joint fit, and the slow runs hardly feel it.
-    problem, stage = solved.onward, solved.problem.stage
+    stage, problem = solved.problem.stage, solved.onward
     law = hysteresis_of(stage) if problem.chain.size else None
     columns_um = np.asarray(columns_of(law)) if isinstance(law, Preisach) else np.zeros(0)
-    drives = hysteresis_alone(stage, solved.runs)
+    start, drives = replace(problem, columns_um=columns_um), hysteresis_alone(stage, solved.runs)
     shifts, best = np.zeros(len(plan.records)), solved
     for k in far:
-        run = solved.runs[k]
-        response = measure_response(run, drives[k])
+        response = measure_response(solved.runs[k], drives[k])
         if not len(response.frequency_Hz):
             continue
-        step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
-        tried = best_shifts(stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))
-        for shift in filter(None, tried[:3]):
-            there = shifts.copy()
-            there[k] = shift
-            plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
-            turn = np.exp(2j * np.pi * response.frequency_Hz * shift)
-            moved = replace(response, response=response.response * turn, sampled=None)
-            runs = plan.shifted(there).runs([one.stride for one in solved.runs])
-            for candidate in start_stages(stage, [moved])[:1]:
-                z = np.asarray(problem.chain.coordinates.of(candidate))
-                start = replace(problem, z=z, columns_um=columns_um, hyper=None)
-                found = try_chain(start, runs, plan.loss, plan.progress, rough=True)
-                # As likely as if it left 0.7 of the run's residual.
-                if found is not None and found.cost < best.cost + float(run.fitted.sum()) * np.log(0.7):
-                    best, shifts = found, there
-    return (shifts, replace(problem, z=best.z, columns_um=columns_um)) if np.any(shifts) else None
+        there, found = _best_delay(plan, best, replace(start, hyper=None), response, shifts, k)
+        # As likely as if it left 0.7 of the run's residual.
+        if found.cost < best.cost + float(solved.runs[k].fitted.sum()) * np.log(0.7):
+            best, shifts = found, there
+    return (shifts, replace(start, z=best.z)) if np.any(shifts) else None
+
+
+def _best_delay(
+    plan: Plan, best: Solved, problem: Problem, response: MeasuredResponse, shifts: np.ndarray, k: int
+) -> tuple[np.ndarray, Solved]:
+    """Delay one run by what its response suggests: the shifts that leave least, and what they leave; or the best."""
+    found, run = [(shifts, best)], best.runs[k]
+
+    def cost(shift: float, start: Problem) -> float:
+        plan.progress(f"{run.record.source}: trying a delay of {1e3 * shift:.4g} ms")
+        there = np.r_[shifts[:k], shift, shifts[k + 1 :]]
+        runs = plan.shifted(there).runs([one.stride for one in best.runs])
+        one = try_chain(start, runs, plan.loss, plan.progress, rough=True)
+        found.extend([(there, one)] if one is not None else [])
+        return np.inf if one is None else one.cost
+
+    step = min(1.0 / run.rate_Hz, 0.1 / response.frequency_Hz.max())
+    tried = best_shifts(problem.stage, response, step * np.arange(-_FARTHEST_SAMPLES, _FARTHEST_SAMPLES + 1))
+    for shift in filter(None, tried[:3]):
+        turn = np.exp(2j * np.pi * response.frequency_Hz * shift)
+        moved = replace(response, response=response.response * turn, sampled=None)
+        for candidate in start_stages(problem.stage, [moved])[:1]:
+            cost(shift, replace(problem, z=np.asarray(problem.chain.coordinates.of(candidate))))
+    there, nearest = min(found, key=lambda one: one[1].cost)
+    if nearest is not best:
+        # A response that a hysteresis bends has its least beside the delay.
+        bounds = there[k] - _BESIDE * step, there[k] + _BESIDE * step
+        settings = {"maxiter": _NARROWED, "xatol": 0.1 * step}
+        start = (replace(problem, z=nearest.z),)
+        minimize_scalar(cost, args=start, bounds=bounds, method="bounded", options=settings)
+    return min(found, key=lambda one: one[1].cost)
