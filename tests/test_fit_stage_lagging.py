@@ -12,8 +12,9 @@ import data_synth
 import fits
 import microid as m
 from fits.diagnosis import _baseline
+from fits.stage._plan import Plan
 from fits.stage._solve import Problem
-from fits.stage._steps import Plan, _visible
+from fits.stage._steps import _visible
 
 RATE_Hz, LAG_s, FINE = 10_000.0, 0.55e-3, 40
 

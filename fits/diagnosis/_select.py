@@ -132,7 +132,8 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
                 drop = max(drop, model.cost - end[-1].cost)
             is_noise = end[-1].is_noise(end[1], thresholds.chance_z)
             alone = is_noise and not model.is_noise(projector, thresholds.chance_z)
-            predicts = improvement_z(before, rival.held_out) > thresholds.worse_z
+            # What is predicted better beside a lag of none is so by the poles that were found with it.
+            predicts = not rival.form.lag and improvement_z(before, rival.held_out) > thresholds.worse_z
             if not (predicts or end[-1].determined(thresholds.determined_z, False, alone)):
                 continue
             # What it explains is lost where all is fitted together, or it explains less than its score promised.

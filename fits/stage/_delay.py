@@ -14,10 +14,11 @@ from fits.loop._result import FitResult
 from fits.loop._run import Run
 from fits.stage._columns import pieces
 from fits.stage._moments import along, linearise
+from fits.stage._plan import Plan
 from fits.stage._run import hysteresis_of, nuisance_columns, project_out, simulate_stage
 from fits.stage._solve import Problem, Solved, try_chain
 from fits.stage._start import MeasuredResponse, best_shifts, measure_response, start_stages
-from fits.stage._steps import Plan, hysteresis_alone
+from fits.stage._steps import hysteresis_alone
 from fits.stage._uncertainty import NO_PRECISION, Precision, sandwich
 from fits.stats._metrics import TWO_SIDED_95
 from microid import Preisach, Stage

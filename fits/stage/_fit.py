@@ -22,6 +22,7 @@ from fits.loop._run import Progress, Run, prepare_run
 from fits.loop._stepped import refuse_many_steps
 from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
+from fits.stage._plan import Plan
 from fits.stage._run import (
     gain_ahead,
     place_of_hysteresis,
@@ -31,7 +32,7 @@ from fits.stage._run import (
     yields_inside,
 )
 from fits.stage._solve import Problem, Solved
-from fits.stage._steps import Plan, present_problem, refine_problem, start_problem, starts_as_it_is
+from fits.stage._steps import present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision, estimates
 from fits.stats._metrics import WHITE
 

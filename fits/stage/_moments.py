@@ -114,6 +114,8 @@ def split_moments(total: Moments, size: int, damping: float) -> tuple[Moments, n
     """
     gram, cross = np.asarray(total.gram), np.asarray(total.cross_um)
     block = gram[size:, size:]
-    block = block + damping * np.diag(np.diagonal(block)) + 1e-14 * np.trace(block) * np.eye(len(block))
+    # What nothing depends on, such as a lag at its bound, stays where it is.
+    least = max(1e-14 * float(np.trace(block)), np.finfo(float).tiny)
+    block = block + damping * np.diag(np.diagonal(block)) + least * np.eye(len(block))
     answer, follow = np.linalg.solve(block, cross[size:]), np.linalg.solve(block, gram[size:, :size])
     return total.reduced(size, answer, follow), answer, follow

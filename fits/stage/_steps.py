@@ -2,33 +2,32 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from fits.io._errors import DataError
-from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid
 from fits.loop._misfit import misfits, without_impulses
 from fits.loop._result import FitError, FitStatus
-from fits.loop._run import Progress, Run, prepare_run, simulate_run
+from fits.loop._run import Run, simulate_run
 from fits.stage._chain import offsets_out
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
+from fits.stage._plan import Plan
 from fits.stage._run import (
     free_grid,
     hysteresis_of,
     named_parts,
     place_of_hysteresis,
-    settled_samples,
     simulate_stage,
     yields_inside,
 )
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
 from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages
 from fits.stage._uncertainty import Precision
-from microid import Driver, Hold, Mechanics, Preisach, Stage, innermost
+from microid import Driver, Mechanics, Preisach, Stage, innermost
 from microid.effects import EFFECTS
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
@@ -39,72 +38,6 @@ _BAD = 3.0
 _SETTLED = 0.2
 # Steps per sample that a fit takes at most.
 _FINEST = 16
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What was asked for, and whether an unknown past is `estimated`.
-
-    The command of each record runs between samples as `holds` say, and comes `shifts_s` later; samples that have
-    `settled`, `(n,)`, are fitted.
-    """
-
-    records: tuple[Record, ...]
-    states: tuple[str, ...]
-    fraction: float
-    range_V: tuple[float, float]
-    loss: str
-    progress: Progress
-    gain: float | None
-    holds: tuple[Hold, ...]
-    accept_best: bool
-    estimated: bool = False
-    shifts_s: tuple[float, ...] = ()
-    settled: tuple[np.ndarray, ...] = ()
-
-    def runs(self, strides: Sequence[int] = ()) -> list[Run]:
-        """The records, the intervals of each divided into so many steps, or not at all."""
-        shifts, each = self.shifts_s or (0.0,) * len(self.records), strides or (1,) * len(self.records)
-        return [self.run(k, *both) for k, both in enumerate(zip(each, shifts, strict=True))]
-
-    @property
-    def interval_s(self) -> float:
-        """Shortest of the sampling intervals."""
-        return min(float(np.median(np.diff(record.time_s))) for record in self.records)
-
-    def run(self, k: int, stride: int, shift_s: float = 0.0) -> Run:
-        """One of them, its command that much later."""
-        record, usable = self.records[k], self.settled[k] if self.settled else None
-        if shift_s:
-            time = record.time_s - shift_s
-            # Beyond the record's ends nobody knows the command.
-            there = (time >= record.time_s[0]) & (time <= record.time_s[-1])
-            usable = there if usable is None else there & usable
-            later = np.interp(time, record.time_s, record.voltage_V)
-            record = replace(record, voltage_V=later)
-        settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.holds[k]
-        return prepare_run(record, *settings, usable, self.estimated)
-
-    def behind(self, solved: Solved) -> "Plan | None":
-        """The same without what an unknown past reaches behind the lag that was found; None where that is hardly any.
-
-        The hysteresis is driven by what lags the command: it turns later, and short of the command's ends.
-        """
-        if self.estimated:
-            return None
-        settled = self.settled_for(solved.stage, solved.runs)
-        lost = [np.sum(run.fitted & ~own) / run.fitted.sum() for run, own in zip(solved.runs, settled, strict=True)]
-        if max(lost) < 0.01:  # not worth another fit
-            return None
-        return replace(self, settled=settled)
-
-    def settled_for(self, stage: Stage, runs: Sequence[Run]) -> tuple[np.ndarray, ...]:
-        """What no longer depends on the past of each run, shape `(n,)`."""
-        return tuple(settled_samples(stage, *each) for each in zip(runs, self.states, strict=True))
-
-    def shifted(self, shifts_s: np.ndarray) -> "Plan":
-        """The same with the command of each run that much later, in s, shape `(runs,)`."""
-        return replace(self, shifts_s=tuple(map(float, shifts_s)))
 
 
 def starts_as_it_is(stage: Stage) -> bool:
@@ -204,11 +137,19 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         refuse_unidentifiable(beside, drives, fast=fast != slow)
         return _without_lag(problem, beside)
     if plan.accept_best and any(one.far for one in misfits(runs, solved.residuals_um)):
+        # A hysteresis that was read off beforehand may leave that much by itself.
+        solved = try_chain(problem, runs, plan.loss, plan.progress, rough=True) or solved
+        problem = solved.onward
+    if plan.accept_best and any(one.far for one in misfits(runs, solved.residuals_um)):
         # What a fit in a bad minimum leaves looks like many things; beside a lag it may find the poles.
         beside = _beside_lag(plan, problem, runs, responses)
-        least = math.log(_BAD) * sum(int(run.fitted.sum()) for run in runs)
-        if beside and solved.cost - beside.cost > least and _identifiable(beside, drives, fast != slow):
-            return _without_lag(problem, beside)
+        if beside and _identifiable(beside, drives, fast != slow):
+            least = math.log(_BAD) * sum(int(run.fitted.sum()) for run in runs)
+            other = _without_lag(problem, beside)
+            if solved.cost - beside.cost > least:
+                return other
+            there = try_chain(other, runs, plan.loss, plan.progress, rough=True)
+            problem = there.onward if there is not None and there.cost < solved.cost else problem
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
@@ -218,9 +159,12 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
 
 
 def _without_lag(problem: Problem, beside: Solved) -> Problem:
-    """Go on from a fit that had a lag of the reading at the end, without that."""
-    poles = problem.chain.coordinates.of(beside.stage.without(beside.stage.names[-1]))
-    return replace(problem, z=np.asarray(poles), columns_um=beside.columns_um)
+    """Go on from a fit that had a lag of the reading at the end, with the driver as late as both together."""
+    lag: Any = beside.stage.parts[-1]
+    stage = beside.stage.without(beside.stage.names[-1])
+    for name, driver in named_parts(stage, Driver)[:1]:
+        stage = stage.swap(name, replace(driver, time_constant_s=driver.time_constant_s + getattr(lag, lag.lag)))
+    return replace(problem, z=np.asarray(problem.chain.coordinates.of(stage)), columns_um=beside.columns_um)
 
 
 def _identifiable(solved: Solved, drives: Sequence[np.ndarray], fast: bool) -> bool:
