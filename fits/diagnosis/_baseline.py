@@ -35,6 +35,8 @@ _COARSE = 4
 # Steps between samples in which the plain stage is simulated where those of its fit are off by more than this, in
 # all samples together, in noise.
 _FINE, _LARGEST_DIFFERENCE = 16, 1.0
+# What shows of another way of the command is as large as that way makes it, within this part.
+_AS_LARGE = 0.25
 
 
 class Fixed(eqx.Module):
@@ -241,15 +243,21 @@ def _prepared(
 def _hold_of(stage: Stage, run: Run, least: float) -> Hold:
     """How the command of a run seems to go between samples, by what a stage that was fitted to others predicts.
 
-    As in the others unless another way takes off the least part of the fast changes that are left; slow errors of the
-    stage are small there.
+    As in the others unless another way takes off the least part of the fast changes that are left, and they are as
+    large as that way makes them; slow errors of the stage are small there. What else comes late, as behind a slew
+    limit, is late by another amount.
     """
-    found: dict[Hold, float] = {}
-    for hold in get_args(Hold):
-        left = run.displacement_um - simulate(stage, replace(run, hold=hold))
-        found[hold] = float(np.sum(np.diff(left[run.known]) ** 2))
-    best = min(found, key=lambda hold: found[hold])
-    return best if found[best] < (1 - least) * found[stage.hold] else stage.hold
+    way: dict[Hold, np.ndarray] = {
+        hold: np.diff(simulate(stage, replace(run, hold=hold))[run.known]) for hold in get_args(Hold)
+    }
+    left = np.diff(run.displacement_um[run.known]) - way[stage.hold]
+    best, found = stage.hold, (1 - least) * float(left @ left)
+    for hold, moved in way.items():
+        change = moved - way[stage.hold]
+        size = float(left @ change) / max(float(change @ change), 1e-300)
+        if abs(size - 1) < _AS_LARGE and (cost := float(np.sum((left - change) ** 2))) < found:
+            best, found = hold, cost
+    return best
 
 
 def _with_enough_steps(stage: Stage, run: Run, finer: Run) -> Run:
