@@ -1,15 +1,20 @@
 """Which way of a command between samples a diagnosis takes, by what lines and the other leave."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits import Record
 from fits.diagnosis import _plain_fit
+from fits.diagnosis._baseline import _hold_of, simulate
 from fits.diagnosis._plain_fit import PlainFit
 from fits.diagnosis._prepare import _hold_of_plateaus
 from fits.diagnosis._thresholds import THRESHOLDS
+from fits.loop._run import prepare_run
+from microid import Driver, Piezo, Stage
 
 
 def prefers(hold, lines, other, late, late_after=0.0, best=None, best_after=0.0):
@@ -169,3 +174,16 @@ def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(monk
         for here, there in ((less, more), (more, less)):
             fit.left_beside_best, other = here, Other(holds=("smooth",), left_beside_best=there)
             assert PlainFit.outdoes(fit, other) == (here < there if far else kept)
+
+
+@pytest.mark.parametrize(("times", "taken"), [(0.0, "first"), (0.9, "zero"), (1.1, "zero"), (1.5, "first")])
+def test_a_held_out_command_goes_in_steps_where_as_much_as_they_make_shows(times, taken):
+    """Behind a slew limit a pulse is late, too, but by one and a half times what steps are late by."""
+    rng, stage = np.random.default_rng(0), Stage.of(driver=Driver(jnp.asarray(2e-3)), piezo=Piezo(jnp.asarray(1.0)))
+    voltage_V = 50 + np.cumsum(rng.normal(size=400))
+    record = Record(1e-3 * np.arange(400), voltage_V, voltage_V, source="aside.csv")
+    run = prepare_run(record, (float(voltage_V.min()), float(voltage_V.max())), "unknown", 0.0, 4)
+    lines, steps = (simulate(stage, replace(run, hold=hold)) for hold in ("first", "zero"))
+    reading_um = lines + times * (steps - lines) + 0.05 * rng.normal(size=400)
+    read = replace(run, record=replace(record, displacement_um=reading_um))
+    assert _hold_of(stage, read, 0.06) == taken
