@@ -149,7 +149,8 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             if solved.cost - beside.cost > least:
                 return other
             there = try_chain(other, runs, plan.loss, plan.progress, rough=True)
-            problem = there.onward if there is not None and there.cost < solved.cost else problem
+            if there is not None and there.cost < solved.cost:
+                solved, problem = there, there.onward
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
