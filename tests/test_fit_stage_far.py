@@ -32,16 +32,18 @@ def walk(rng, count):
     return 0.5 + 99 * (noise - noise.min()) / np.ptp(noise)
 
 
-def multisine(rng, count):
+def multisine(rng, count, spacing_Hz=0.0):
+    """Lines at multiples of a spacing, or wherever they come to lie."""
     time_s = np.arange(count) / RATE_Hz
     lines_Hz = np.r_[21.0, np.geomspace(40, 660, 12)]
+    lines_Hz = spacing_Hz * np.round(lines_Hz / spacing_Hz) if spacing_Hz else lines_Hz
     size = np.r_[24.0, np.full(12, 1.0)]
     return 50 + np.cos(2 * np.pi * np.outer(time_s, lines_Hz) + rng.uniform(0, 6.3, 13)) @ size
 
 
-def check_poles(rng):
-    """Fit a walk and a multisine, and compare the poles with those of the rig."""
-    commands = walk(rng, 3000), multisine(rng, 3000)
+def ends_near(rng, spacing_Hz=0.0):
+    """Whether the plain fit of a walk and a multisine has the poles of the rig."""
+    commands = walk(rng, 3000), multisine(rng, 3000, spacing_Hz)
     records = [
         fits.Record(np.arange(3000) / RATE_Hz, one, moved_um(one) + 0.003 * rng.normal(size=3000), source=name)
         for one, name in zip(commands, ("walk.csv", "fast.csv"), strict=True)
@@ -49,16 +51,18 @@ def check_poles(rng):
     stage = fit_baseline(records, [], 0.0, "unknown", print).stage
     [driver] = [part for part in stage.parts if isinstance(part, Driver)]
     [mode] = [part for part in stage.parts if isinstance(part, Mechanics)]
-    assert float(driver.time_constant_s) == pytest.approx(LAG_s, rel=0.03)
-    assert float(mode.natural_frequency_Hz) == pytest.approx(NATURAL_Hz, rel=0.01)
-    assert float(mode.damping_ratio) == pytest.approx(DAMPING, rel=0.05)
+    found = float(driver.time_constant_s), float(mode.natural_frequency_Hz), float(mode.damping_ratio)
+    print(found)
+    return np.allclose(np.array(found) / (LAG_s, NATURAL_Hz, DAMPING), 1, rtol=0, atol=(0.03, 0.01, 0.05))
 
 
 def test_a_plain_fit_that_is_far_from_noise_begins_again():
     """Of eight rigs this one had come to a driver of 17 ms and a mode of 3 kHz without damping."""
-    check_poles(np.random.default_rng(8))
+    assert ends_near(np.random.default_rng(8))
 
 
 @pytest.mark.study
-def test_so_does_that_of_a_fresh_rig(rng):
-    check_poles(rng)
+def test_so_do_those_of_fresh_rigs(rng):
+    """Of 20 fresh rigs all did; where 98 of 100 do, fewer than six of eight do once in 2,000 runs."""
+    # Two periods: where a run first meets its own ends late, hardly a sample is left whose past is known.
+    assert sum(ends_near(rng, 2 * RATE_Hz / 3000) for _ in range(8)) >= 6
