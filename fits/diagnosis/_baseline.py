@@ -15,7 +15,7 @@ from fits.io.columns.path import PATH, gone_V
 from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
-from fits.loop._run import Run, prepare_run
+from fits.loop._run import Run, pasts_to_estimate, prepare_run
 from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
@@ -26,8 +26,6 @@ from fits.stats._noise import rough_noise_um
 from microid import Driver, Hold, Mechanics, Preisach, Stage
 from microid.effects import AbstractEffect, extend, host
 
-# A voltage has been at an end once it comes this close, as a part of the range.
-_NEAR = 0.01
 # What a finer grid would follow has a prior of its own in the projection.
 _FINEST = 32
 # Steps between samples in which effects are simulated, at most.
@@ -158,7 +156,8 @@ def fit_baseline(
     # What is fastest shows best how commands go on.
     rates = [np.diff(record.voltage_V) / np.diff(record.time_s) for record in records]
     hold = holds[int(np.argmax([np.mean(rate**2) for rate in rates]))]
-    past = has_known_loop(records, range_V, holdout)
+    past = pasts_to_estimate(records, range_V, holdout)
+    past_aside = (any(past),) * len(aside)
     try:
         near = None if onward is None else onward.held(hold)
         stage = default_stage(hold) if near is None else near.stage
@@ -175,11 +174,11 @@ def fit_baseline(
 
     def prepared(least: int, most: int) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
         many = [int(np.clip(stride, least, most)) for stride in strides]
-        held = _prepared(aside, range_V, initial, 0.0, [max(many)] * len(aside), past, held_holds)
+        held = _prepared(aside, range_V, initial, 0.0, [max(many)] * len(aside), past_aside, held_holds)
         return _prepared(records, range_V, initial, holdout, many, past, holds), held
 
     # A run whose history is unknown to its end says little of that, and is no error.
-    asked = _prepared(aside, range_V, initial, 1.0, [_FINE] * len(aside), False)
+    asked = _prepared(aside, range_V, initial, 1.0, [_FINE] * len(aside), (False,) * len(aside))
     held_holds = [_hold_of(solved.stage, run, better) for run in asked]
     (runs, held), (finest, finest_held) = prepared(1, max(strides)), prepared(_FINE, max(*strides, _FINE))
     # Behind a step a reading has corners that whole steps do not show to what reads it between samples.
@@ -195,22 +194,6 @@ def fit_baseline(
         problem=solved.onward,
         hyper=solved.hyper,
     )
-
-
-def has_known_loop(records: Sequence[Record], range_V: tuple[float, float], holdout: float) -> bool:
-    """Whether the fitted samples go up and down through the range where no unknown past reaches them.
-
-    Otherwise nothing would be left beside it.
-    """
-    up_V = down_V = 0.0
-    for record in records:
-        voltage, near = record.voltage_V, _NEAR * (range_V[1] - range_V[0])
-        highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
-        swept = (highest >= voltage.max() - near) & (lowest <= voltage.min() + near)
-        swept[len(record) - round(holdout * len(record)) :] = False
-        moves_V = np.diff(voltage)[swept[1:]]
-        up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
-    return min(up_V, down_V) >= (1 - 2 * _NEAR) * (range_V[1] - range_V[0])
 
 
 def with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:
@@ -231,13 +214,13 @@ def _prepared(
     initial: str,
     holdout: float,
     strides: Sequence[int],
-    estimated: bool,
+    estimated: Sequence[bool],
     holds: Sequence[Hold] = (),
 ) -> tuple[Run, ...]:
     lines: list[Hold] = ["first"] * len(records)
-    each = zip(records, strides, holds or lines, strict=True)
+    each = zip(records, strides, holds or lines, estimated, strict=True)
     settings = range_V, initial, holdout
-    return tuple(prepare_run(one, *settings, stride, hold=hold, estimated=estimated) for one, stride, hold in each)
+    return tuple(prepare_run(one, *settings, stride, hold=hold, estimated=past) for one, stride, hold, past in each)
 
 
 def _hold_of(stage: Stage, run: Run, least: float) -> Hold:
@@ -276,13 +259,13 @@ def _static(
     range_V: tuple[float, float],
     holdout: float,
     initial: str,
-    past: bool,
+    past: Sequence[bool],
     remarks: tuple[str, ...],
     progress: Callable[[str], None],
 ) -> Baseline:
     ready, held = (
         _prepared(records, range_V, initial, holdout, [1] * len(records), past),
-        _prepared(aside, range_V, initial, 0.0, [1] * len(aside), past),
+        _prepared(aside, range_V, initial, 0.0, [1] * len(aside), (any(past),) * len(aside)),
     )
     stroke, tried, _ = choose_grid(list(ready), None, progress, _FINEST)
     grid = tried.data.grid

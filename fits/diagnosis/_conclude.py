@@ -135,7 +135,7 @@ def conclude(
         remarks.append(
             "the time was over: intervals of what was found are those of its curvature, and may be too narrow"
         )
-    if all(run.has_past for run in baseline.runs):
+    if any(run.has_past for run in baseline.runs):
         # It is fitted as one more part of the past that is estimated, which is beside all that is asked.
         causes = tuple(one for one in causes if not card_of(one.name).past)
         if kept and all(card_of(one.name).past for one in kept):

@@ -29,6 +29,10 @@ _FEWEST = 50
 _SHORTEST = 4096
 # Part of the way to it by which peaks of smooth commands miss their highest.
 _ALMOST = 1e-2
+# A voltage has been at an end once it comes this close, as a part of the range.
+_AT_END = 0.01
+# Most samples of a record are more than this part.
+_HALF = 0.5
 # Steps between samples that show derivatives well enough.
 _FEW_STEPS = 4
 # Told what is being done, a sentence at a time.
@@ -223,6 +227,32 @@ def prepare_run(
     lower, upper = ahead * lower, ahead * upper
     start = initial_state(initial, lower, upper)
     return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, has_past)
+
+
+def pasts_to_estimate(
+    records: Sequence[Record], range_V: tuple[float, float], holdout: float, most: bool = False
+) -> tuple[bool, ...]:
+    """Of which records, all in their order, the unknown past is estimated beside the rest.
+
+    Of all, or where that leaves no whole loop, and with `most` in any case, of those only that would lose most of
+    their samples to it. The samples that are fitted must go up and down through the range where no unknown past
+    reaches them: otherwise nothing would be left beside it.
+    """
+    known = [known_samples(record.voltage_V, *range_V) for record in records]
+    losing = tuple(float(np.mean(one)) < _HALF for one in known)
+    for chosen in (losing,) if most else ((True,) * len(records), losing):
+        up_V = down_V = 0.0
+        for record, own, estimated in zip(records, known, chosen, strict=True):
+            voltage, near = record.voltage_V, _AT_END * (range_V[1] - range_V[0])
+            highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
+            both = (highest >= voltage.max() - near) & (lowest <= voltage.min() + near)
+            swept = both if estimated else own.copy()
+            swept[len(record) - round(holdout * len(record)) :] = False
+            moves_V = np.diff(voltage)[swept[1:]]
+            up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
+        if min(up_V, down_V) >= (1 - 2 * _AT_END) * (range_V[1] - range_V[0]):
+            return chosen
+    return (False,) * len(records)
 
 
 def _as_far_as_it_goes(voltage_V: np.ndarray) -> int:

@@ -18,12 +18,13 @@ from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, RunReport
-from fits.loop._run import Progress, Run, prepare_run
+from fits.loop._run import Progress, Run, pasts_to_estimate, prepare_run
 from fits.loop._stepped import refuse_many_steps
 from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._plan import Plan
 from fits.stage._run import (
+    free_grid,
     gain_ahead,
     place_of_hysteresis,
     residual_of,
@@ -35,6 +36,8 @@ from fits.stage._solve import Problem, Solved
 from fits.stage._steps import present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision, estimates
 from fits.stats._metrics import WHITE
+
+_PAST = "{}: what the rig went through before is unknown and estimated beside the rest; most samples depend on it"
 
 
 def default_stage(hold: m.Hold = "first") -> m.Stage:
@@ -132,7 +135,9 @@ def fit_stage(
     if unit is not None:
         remedy = "name the right one among the columns, as in time_s=NAME[ms]"
         summary = Alternative.in_unit(summary, unit[1]).widen(summary, unit[0], remedy)
-    summary = replace(summary, remarks=(*solved.problem.remarks, *summary.remarks))
+    pasts = [run.record.source for run in runs if run.has_past]
+    said = [_PAST.format(", ".join(pasts))] if pasts else []
+    summary = replace(summary, remarks=(*solved.problem.remarks, *said, *summary.remarks))
     return completed(summary, solved, (*records, *aside), loss)
 
 
@@ -164,15 +169,16 @@ def solve_stage(
     progress: Progress,
     finest: int = LADDER[-1],
     accept_best: bool = False,
-    estimated: bool = False,
+    estimated: Sequence[bool] = (),
     onward: Problem | None = None,
     holds: Sequence[m.Hold] = (),
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
     `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
-    adds may be `estimated` beside the rest. The fit goes `onward` from another one, or begins where the runs say.
-    Commands run between samples as the stage says, or each as one of `holds`.
+    adds is `estimated` beside the rest for some records: of those given, or of any that would lose most of its
+    samples to it. The fit goes `onward` from another one, or begins where the runs say. Commands run between samples
+    as the stage says, or each as one of `holds`.
     """
     fraction, _, range_V = check_fit(records, holdout, loss, levels)
     for record in records:
@@ -181,6 +187,8 @@ def solve_stage(
     if len(states) != len(records):
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
     stage = default_stage() if stage is None else stage
+    if not estimated and free_grid(stage) is not None and set(states) == {"unknown"}:
+        estimated = pasts_to_estimate(records, range_V, fraction, most=True)
     ahead = stage.parts[: place_of_hysteresis(stage)]
     if stage.hold == "zero" and not any(isinstance(part, m.Driver) for part in ahead):
         raise DataError(
@@ -191,7 +199,7 @@ def solve_stage(
         *(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage)),
         tuple(holds) or (stage.hold,) * len(records),
         accept_best=accept_best,
-        estimated=estimated,
+        estimated=tuple(estimated),
     )
     if onward is not None:
         problem = onward

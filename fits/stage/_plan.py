@@ -14,7 +14,7 @@ from microid import Hold, Stage
 
 @dataclass(frozen=True)
 class Plan:
-    """What was asked for, and whether an unknown past is `estimated`.
+    """What was asked for, and of which records an unknown past is `estimated`; of none where that is empty.
 
     The command of each record runs between samples as `holds` say, and comes `shifts_s` later; samples that have
     `settled`, `(n,)`, are fitted.
@@ -29,7 +29,7 @@ class Plan:
     gain: float | None
     holds: tuple[Hold, ...]
     accept_best: bool
-    estimated: bool = False
+    estimated: tuple[bool, ...] = ()
     shifts_s: tuple[float, ...] = ()
     settled: tuple[np.ndarray, ...] = ()
 
@@ -54,14 +54,14 @@ class Plan:
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later)
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.holds[k]
-        return prepare_run(record, *settings, usable, self.estimated)
+        return prepare_run(record, *settings, usable, bool(self.estimated) and self.estimated[k])
 
     def behind(self, solved: Solved) -> "Plan | None":
         """The same without what an unknown past reaches behind the lag that was found; None where that is hardly any.
 
         The hysteresis is driven by what lags the command: it turns later, and short of the command's ends.
         """
-        if self.estimated:
+        if any(self.estimated):
             return None
         settled = self.settled_for(solved.stage, solved.runs)
         lost = [np.sum(run.fitted & ~own) / run.fitted.sum() for run, own in zip(solved.runs, settled, strict=True)]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,6 +26,8 @@ from microid import Hold, Stage
 _ROUNDS, _ROUGH = 40, 12
 # What a step that fails multiplies Marquardt's damping by, and where it gives up.
 _FACTOR, _HIGHEST = 10.0, 1e6
+# Part of what the linearisation says of the gain of a step, below which that is not trusted so far.
+_WORTH = 0.5
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
 _STATIONARY = 0.02
 # A run is given up where this many times as much is left of it, since neighbouring samples of it agree.
@@ -175,6 +178,8 @@ def solve_chain(
     counted: tuple[float, ...] = ()
     settled: Solved | None = None
     best, last = np.inf, 0
+    rounds: list[tuple[tuple[float, ...], Hyper | None]] = []
+    known: Hyper | None = None
     for number in range(_ROUGH if rough else _ROUNDS):
         runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
@@ -187,13 +192,22 @@ def solve_chain(
         if accept_best and number >= last + _PATIENCE:
             # Smoothness and noise take turns.
             break
+        rounds.append((weighing.noise_um, hyper))
+        if number >= last + _PATIENCE and not rough:
+            # For an answer both are held at their means then, so that there is one objective, which falls.
+            turns = rounds[last + 1 : last + 1 + _PATIENCE]
+            noises, hypers = zip(*turns, strict=True)
+            weighing = replace(weighing, noise_um=tuple(np.exp(np.mean(np.log(noises), axis=0))))
+            known = None if hyper is None else jax.tree.map(lambda *logs: np.mean(logs), *hypers)
         # Far from the answer, what a run leaves says nothing of its noise: weighed by it, one run would be given up.
         weights = weighing.alike() if rough else weighing
         total = weights.total(sums)
         here = weights.cost_um2(runs, [one.residual_um for one in sums])
         while True:
             try:
-                step, columns, hyper, variance, distance = _step(problem, total, columns_um, hyper, weights, damping)
+                step, columns, hyper, variance, distance = _step(
+                    problem, total, columns_um, hyper, weights, damping, known
+                )
                 if chain.grid is None:
                     # A law that a far start makes useless would be lost at a bound.
                     most = np.maximum(1.0, 0.5 * np.abs(z))
@@ -211,7 +225,9 @@ def solve_chain(
             old = here / variance + columns_um @ prior @ columns_um
             new = there / variance + columns @ prior @ columns
             if new <= old:
-                z, columns_um, damping = z + step, columns, damping / _FACTOR
+                z, columns_um = z + step, columns
+                # A step that gains much less than the linearisation says goes too far (Marquardt 1963).
+                damping *= 1 / _FACTOR if old - new > _WORTH * len(step) * distance**2 else _FACTOR
                 break
             # Within rounding of the optimum nothing falls any more.
             if distance < _STATIONARY:
@@ -282,7 +298,13 @@ def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequen
 
 
 def _step(
-    problem: Problem, total: Moments, columns_um: np.ndarray, hyper: Hyper | None, weighing: Weighing, damping: float
+    problem: Problem,
+    total: Moments,
+    columns_um: np.ndarray,
+    hyper: Hyper | None,
+    weighing: Weighing,
+    damping: float,
+    known: Hyper | None,
 ) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
     """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
     chain, stroke_um = problem.chain, problem.stroke_um
@@ -290,7 +312,7 @@ def _step(
     size = 0 if hyper is None else chain.size
     reduced, step, follow = split_moments(total, size, damping)
     if hyper is not None and chain.grid is not None:
-        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, hyper)
+        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, hyper, known=known)
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
         variance = float(np.exp(hyper.log_variance)) * stroke_um**2
@@ -300,7 +322,8 @@ def _step(
         prior = scale_free(prior_precision(chain, hyper, stroke_um), columns)
     information = marginal_information(total, size, prior, variance)
     # However short the damping makes a step, it is far from the optimum where a whole one is long.
-    whole = split_moments(total, 0, 0.0)[1] if chain.grid is None else step
+    _, whole, back = split_moments(total, size, 0.0)
+    whole = whole - back @ columns[:size]
     return step, columns, hyper, variance, max(float(whole @ information @ whole) / len(step), 0.0) ** 0.5
 
 

@@ -136,27 +136,39 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             raise
         refuse_unidentifiable(beside, drives, fast=fast != slow)
         return _without_lag(problem, beside)
-    if plan.accept_best and any(one.far for one in misfits(runs, solved.residuals_um)):
-        # A hysteresis that was read off beforehand may leave that much by itself.
-        solved = try_chain(problem, runs, plan.loss, plan.progress, rough=True) or solved
-        problem = solved.onward
-    if plan.accept_best and any(one.far for one in misfits(runs, solved.residuals_um)):
-        # What a fit in a bad minimum leaves looks like many things; beside a lag it may find the poles.
-        beside = _beside_lag(plan, problem, runs, responses)
-        if beside and _identifiable(beside, drives, fast != slow):
-            least = math.log(_BAD) * sum(int(run.fitted.sum()) for run in runs)
-            other = _without_lag(problem, beside)
-            if solved.cost - beside.cost > least:
-                return other
-            there = try_chain(other, runs, plan.loss, plan.progress, rough=True)
-            if there is not None and there.cost < solved.cost:
-                solved, problem = there, there.onward
+    if fitted is not None and any(one.far for one in misfits(runs, solved.residuals_um)):
+        freed = _freed(plan, solved, drives, responses, fast != slow)
+        if plan.accept_best or _identifiable(freed, drives, fast != slow):
+            solved, dropped = freed, None
+            problem = solved.onward
     if dropped is not None:
         # Begin without a mechanics that the runs do not show.
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
         remarks = (_no_resonance(plan, dropped), *simpler.remarks)
         return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
+
+
+def _freed(
+    plan: Plan, solved: Solved, drives: Sequence[np.ndarray], responses: Sequence[MeasuredResponse], fast: bool
+) -> Solved:
+    """Go on from a rough fit that is far from noise with the hysteresis free, which was read off beforehand.
+
+    What a fit in a bad minimum leaves looks like many things; beside a lag of the reading it may find the poles.
+    """
+    runs, settings = solved.runs, (plan.loss, plan.progress)
+    solved = try_chain(solved.onward, runs, *settings, rough=True) or solved
+    if not any(one.far for one in misfits(runs, solved.residuals_um)):
+        return solved
+    beside = _beside_lag(plan, solved.onward, runs, responses)
+    if beside is None or not _identifiable(beside, drives, fast):
+        return solved
+    other = _without_lag(solved.onward, beside)
+    there = try_chain(other, runs, *settings, rough=True)
+    least = math.log(_BAD) * sum(int(run.fitted.sum()) for run in runs)
+    if there is not None and (there.cost < solved.cost or solved.cost - beside.cost > least):
+        return there
+    return solved
 
 
 def _without_lag(problem: Problem, beside: Solved) -> Problem:
