@@ -101,13 +101,18 @@ def conclude(
         rest_noise, left_over = misfit.unnamed(weak or small)
         extension = extend_stage(ready, found, None)
     remarks += minor
+    estimated = any(run.has_past for run in baseline.runs)
     if kept and not repeats and predicts_worse(extension.compared[len(baseline.runs) :], 0.0, 0.0):
-        own = ", ".join(sorted({one.name.replace("_", " ") for one in extension.effects if is_own(one)}))
+        told_of = {
+            one.name for one in extension.effects if is_own(one) and not (estimated and card_of(one.name).past)
+        }
+        own = ", ".join(sorted(name.replace("_", " ") for name in told_of))
         others = extend_stage(ready, found, model, own=False)
         plain = not others.effects or predicts_worse(others.compared[len(baseline.runs) :], 0.0, 0.0)
         extension = without_effects(ready, extension) if plain else others
         how = "the stage is left plain" if plain else "the extended stage is without"
-        remarks.append(f"{own}: not the same in the runs held out, so that {how}")
+        if own:
+            remarks.append(f"{own}: not the same in the runs held out, so that {how}")
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * unit_um < rounding_um)
     cyclic = (
@@ -135,7 +140,7 @@ def conclude(
         remarks.append(
             "the time was over: intervals of what was found are those of its curvature, and may be too narrow"
         )
-    if any(run.has_past for run in baseline.runs):
+    if estimated:
         # It is fitted as one more part of the past that is estimated, which is beside all that is asked.
         causes = tuple(one for one in causes if not card_of(one.name).past)
         if kept and all(card_of(one.name).past for one in kept):

@@ -33,6 +33,8 @@ EVIDENCE_LEVELS = 16
 # is that of the coarse grid itself: what is alike along its diagonal is not so where it is read off between nodes.
 BELIEF_LEVELS = 24
 _ATOL = 1e-6
+# Steps of pivoting, and how many where more columns than this, those of 45 levels, make each take long.
+_STEPS, _FEW_STEPS, _SOON = 500, 50, 1100
 # By so many e-folds the smoothness may differ from what the evidence has.
 _FARTHEST = 14.0
 
@@ -163,7 +165,8 @@ def non_negative(posterior: Posterior) -> tuple[np.ndarray, bool]:
         spread, precision, mean, unit = _marginal(posterior, order)
         if not np.all(np.isfinite(precision)):
             return _one_by_one(posterior)
-        y, found = pivot_nonnegative(precision, -(precision @ mean), np.maximum(mean, 0), _ATOL, 500)
+        most_steps = _STEPS if bounded <= _SOON else _FEW_STEPS
+        y, found = pivot_nonnegative(precision, -(precision @ mean), np.maximum(mean, 0), _ATOL, most_steps)
         if not found:
             return _one_by_one(posterior)
         # All columns move along with the chosen ones, from their mean; where a bound holds it holds exactly.
@@ -181,8 +184,8 @@ def _one_by_one(posterior: Posterior) -> tuple[np.ndarray, bool]:
     from scipy.optimize import nnls  # slow to import, and hardly ever needed
 
     precision = posterior.precision
-    # More columns than this, those of 45 levels, would take it minutes: a coarser grid must do.
-    if len(precision) > 1100:
+    # More columns would take it minutes: a coarser grid must do.
+    if len(precision) > _SOON:
         return np.maximum(posterior.mean, 0), False
     scale = np.sqrt(np.diagonal(precision))
     value, vector = np.linalg.eigh(precision / scale / scale[:, None])

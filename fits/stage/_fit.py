@@ -91,9 +91,11 @@ def fit_stage(
         Number of switching voltages; chosen from the slow runs by default.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
-        that are held out, too; theirs is unknown where each fitted run has its own. With a hysteresis inside the
-        mechanics all but `unknown` mean at rest; after an unknown past, such as a steady state, the samples are left
-        out that depend on where the stage was at rest before.
+        that are held out, too; theirs is unknown where each fitted run has its own. What an unknown one adds is left
+        out, as in `fit`, or estimated beside the rest in a run that would lose most of its samples to it, where other
+        samples hold whole loops. With a hysteresis inside the mechanics all but `unknown` mean at rest; after an
+        unknown past, such as a steady state, the samples are left out that depend on where the stage was at rest
+        before.
     holdout, loss, progress
         See `fit`, as for what is returned.
     """
