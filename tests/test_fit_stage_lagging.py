@@ -53,7 +53,8 @@ def test_a_lag_is_found_whatever_came_before(rng, frequencies_Hz, periods):
     # The rest of a per cent is structure finer than the grid: the least of the plays moves after 0.5 V.
     assert result["driver.time_constant_s"].value == pytest.approx(LAG_s, rel=0.01)
     assert result.held_out.e_rms_pct < 0.02
-    assert not any("neighbouring residuals" in remark for remark in result.remarks)
+    # Structure finer than the grid is alike over a few samples: 1.7 at most on nine rigs.
+    assert max(run.correlation_samples for run in result.runs) < 5
 
 
 def test_a_linear_stage_is_fitted_to_a_run_with_hysteresis(tmp_path):

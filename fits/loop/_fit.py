@@ -25,7 +25,7 @@ from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
 from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
-from fits.stats._metrics import WHITE
+from fits.stats._metrics import TOLD, WHITE
 from fits.stats._noise import LOSSES
 from microid import Preisach
 from microid.densities import FAMILIES
@@ -102,7 +102,7 @@ def fit(
             remarks.append(
                 f"the best two of {starts} starts ended at different fits; there may be a better one: try more starts"
             )
-    if found.correlation > WHITE:
+    if found.correlation > TOLD:
         remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))
     model, columns = found.model, np.asarray(columns_of(found.model))
     surface = tried.data.grid.surface(columns)

@@ -35,7 +35,7 @@ from fits.stage._run import (
 from fits.stage._solve import Problem, Solved
 from fits.stage._steps import present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision, estimates
-from fits.stats._metrics import WHITE
+from fits.stats._metrics import TOLD
 
 _PAST = "{}: what the rig went through before is unknown and estimated beside the rest; most samples depend on it"
 
@@ -244,7 +244,7 @@ def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[m.Stage]:
     for run, noise_um, correlation in zip(solved.runs, weighing.noise_um, weighing.correlation, strict=True):
         figures = {"noise_um": noise_um, "correlation_samples": correlation, "substeps": run.stride}
         reports.append(_report(stage, run, **figures))
-        if correlation > WHITE:
+        if correlation > TOLD:
             remarks.append(f"{run.record.source}: {correlated(correlation, 'creep, rate, a second mode, drift')}")
     reports += [_report(stage, run) for run in held]
     return FitResult(

@@ -9,6 +9,8 @@ import numpy as np
 TWO_SIDED_95 = 1.959964
 # A residual whose neighbours are alike over fewer samples than this counts as white.
 WHITE = 1.2
+# Neighbours that are alike over more samples than this are told of; fewer are one sample in whole ones.
+TOLD = 1.5
 # A loop must span this fraction of the largest excursion to be measured.
 _SPAN = 0.95
 
