@@ -24,8 +24,8 @@ from fits.stats._noise import correlation_samples, huber_weight
 from microid import Hold, Stage
 
 _ROUNDS, _ROUGH = 40, 12
-# What a step that fails multiplies Marquardt's damping by, and where it gives up.
-_FACTOR, _HIGHEST = 10.0, 1e6
+# Marquardt's damping at first, what a step that fails multiplies it by, and where it gives up.
+_FIRST, _FACTOR, _HIGHEST = 1e-4, 10.0, 1e6
 # Part of what the linearisation says of the gain of a step, below which that is not trusted so far.
 _WORTH = 0.5
 # A fit has converged where the optimum is nearer than this many standard deviations per coordinate.
@@ -174,7 +174,7 @@ def solve_chain(
     """
     chain, stroke_um = problem.chain, problem.stroke_um
     z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
-    damping = 1e-4
+    damping = _FIRST
     counted: tuple[float, ...] = ()
     settled: Solved | None = None
     best, last = np.inf, 0
@@ -238,7 +238,10 @@ def solve_chain(
         if damping > _HIGHEST and accept_best:
             break
         if damping > _HIGHEST and not rough:
-            raise FitError(FitStatus.NOT_STATIONARY)
+            if chain.grid is None:
+                raise FitError(FitStatus.NOT_STATIONARY)
+            # Where columns meet their bounds the linearisation promises what no step however short has.
+            distance, damping = 0.0, _FIRST
         if distance < _STATIONARY and not rough and not counted and len(runs) > 1:
             # What is fitted worse is correlated more: run after run would be given up if this were asked again.
             counted = weighing.correlation
