@@ -86,7 +86,7 @@ def solve_grid(
         if abs(float(renewed.log_variance - hyper.log_variance)) > 0.02:  # worth another factorisation
             hyper, posterior = renewed, Posterior.of(moments, rough, renewed)
     else:
-        hyper = maximise_evidence(moments, rough, start)
+        hyper = known or maximise_evidence(moments, rough, start)
         posterior = Posterior.of(moments, rough, hyper)
     return _bounded(posterior, hyper)
 
