@@ -5,10 +5,12 @@ import functools
 import json
 import re
 import shutil
+import socket
+import struct
 import threading
+import time
 import urllib.error
 import urllib.request
-from http.server import ThreadingHTTPServer
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,7 +23,7 @@ from _sweeps import parsed, small
 from test_diagnosis_report import Page
 
 from fits import default_stage, save_model
-from fits.cli.serve import _Pages
+from fits.cli.serve import _Pages, _Server
 from fits.report._diagnosis import report_html
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep, summarise
@@ -46,7 +48,7 @@ def folder_and_address(tmp_path_factory):
     # A sweep that is broken says so in its place.
     (folder / "sweep" / LEDGER).mkdir(parents=True)
     (folder / "sweep" / ABOUT).write_text("{")
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Pages, directory=str(folder)))
+    server = _Server(("127.0.0.1", 0), functools.partial(_Pages, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield folder, f"http://127.0.0.1:{server.server_port}/"
     server.shutdown()
@@ -129,6 +131,22 @@ def test_a_model_and_a_sweep_open_as_pages_and_not_as_json(address, swept):
     for other in ("other.json", "none.json", "whole/sweep.toml", "first/report"):
         assert status_of(f"{address}{other}.html") == (200 if other == "first/report" else 404)
     assert not list(swept.parent.rglob("*.json.html"))
+
+
+def test_a_browser_that_hangs_up_is_not_told_of(tmp_path, capsys):
+    (tmp_path / "large").write_bytes(bytes(50_000_000))
+    server = _Server(("127.0.0.1", 0), functools.partial(_Pages, directory=str(tmp_path)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with socket.create_connection(server.server_address) as asking:
+        asking.sendall(b"GET /large HTTP/1.1\r\nHost: localhost:1\r\n\r\n")
+        assert asking.recv(1) == b"H"
+        # Closed so, the connection is reset, with the rest of the answer on its way.
+        asking.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    while any("process_request_thread" in one.name for one in threading.enumerate()):
+        time.sleep(0.01)
+    server.shutdown()
+    server.server_close()
+    assert capsys.readouterr().err == ""
 
 
 def test_what_cannot_be_served_is_said(address, tmp_path):

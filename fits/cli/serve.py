@@ -1,6 +1,7 @@
 """The command `microid serve`: its options, and the work."""
 
 import functools
+import sys
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -50,6 +51,15 @@ class _Pages(SimpleHTTPRequestHandler):
         """Print nothing."""
 
 
+class _Server(ThreadingHTTPServer):
+    """Answers browsers, which may hang up before they have all."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print what went wrong, but for an answer that nobody waits for any more."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 @click.command()
 @click.argument("folder", metavar="DIR")
 @click.option(
@@ -66,7 +76,7 @@ def serve(given: common.Given) -> None:
         raise DataError(f"{given.folder}: there is no such folder; give one that holds results.")
     pages = functools.partial(_Pages, directory=str(Path(given.folder).resolve()))
     try:
-        opened = ThreadingHTTPServer((_HERE, given.port), pages)
+        opened = _Server((_HERE, given.port), pages)
     except OSError as error:
         why = f"--port {given.port}: the system refuses it ({error.strerror})"
         raise DataError(f"{why}; choose another, or 0 for any that is free.") from None
