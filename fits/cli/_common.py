@@ -297,7 +297,7 @@ def predicted_by(
     path: str,
     loaded: "late.ModelFile | late.PlainModel",
     program: "late.Record",
-    initial: str,
+    initial: "late.Initial",
     progress: Callable[[str], None] = lambda _: None,
 ) -> "late.Prediction":
     """Predict with whatever model a file holds; without an uncertainty the standard deviations are NaN."""

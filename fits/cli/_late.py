@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from fits.io._record import Record
     from fits.io._units import parse_columns
     from fits.loop._fit import fit
-    from fits.loop._plain import PlainModel
-    from fits.loop._prediction import Prediction
+    from fits.loop._plain import PlainModel, memory_named
+    from fits.loop._prediction import Initial, Prediction
     from fits.loop._report import fit_report
     from fits.loop._report_words import describe
     from fits.loop._result import FitError

@@ -13,7 +13,13 @@ from fits.io._length import length
 @options.model
 @click.argument("program", metavar="PROGRAM.csv")
 @options.out_csv("PREDICTION.csv")
-@options.initial("the program")
+@click.option(
+    "--initial",
+    metavar="STATE|RUN",
+    default="negative",
+    show_default=True,
+    help="Memory before the program: negative, positive, demagnetised or unknown, or as before a run of the fit.",
+)
 @options.columns
 @options.json_output
 @common.in_sentences
@@ -23,6 +29,9 @@ def simulate(given: common.Given) -> None:
     PROGRAM.csv needs the columns time_s and voltage_V. The prediction has time_s, voltage_V, displacement_um and
     displacement_sd_um; sensor noise is not in the last. Voltages beyond the model's range, by less than a thousandth
     of it, are taken as its ends, with a remark; others are refused.
+
+    What a rig went through before is remembered until the voltage has been at both ends of its range. Where it is
+    unknown the standard deviation has that. A run of the fit is named as it was then.
     """
     import numpy as np
 
@@ -32,7 +41,8 @@ def simulate(given: common.Given) -> None:
     check_file(given.out)
     record = late.read_table(given.program, required=("time_s", "voltage_V"), **common.reading(given))
     loaded = common.opened(given.model)
-    prediction = common.predicted_by(given.model, loaded, record, given.initial, progress)
+    initial = late.memory_named(given.initial, loaded.report)
+    prediction = common.predicted_by(given.model, loaded, record, initial, progress)
     displacement_um, sd_um = prediction.displacement_um, prediction.displacement_sd_um
     known = loaded.uncertainty is not None
     table = {"time_s": record.time_s, "voltage_V": record.voltage_V, "displacement_um": displacement_um}

@@ -9,7 +9,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fits.loop._run import Run
 from microid import Preisach, Staircase
 
 # Pairs of extremes that stand for the unknown history, and samples that are compared.
@@ -47,20 +46,21 @@ def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
     return _staircase(solution.value, args[0], args[1][0])
 
 
-def estimate_start(model: Preisach, run: Run, noise_um: float) -> Staircase:
-    """Fit the memory before the first sample to the samples that depend on it; the model has this run's offset.
+def estimate_start(
+    model: Preisach, voltage_V: Float[np.ndarray, " n"], displacement_um: Float[np.ndarray, " n"], noise_um: float
+) -> Staircase:
+    """Fit the memory before the first of the samples that depend on it; the model has the offset of their run.
 
     The output is differentiable in the remembered extremes as it is in any voltage, so the extremes themselves are
     the unknowns (Levenberg-Marquardt on `2 x 7` shares of the way from the ends of the range to the first sample).
     """
-    keep = np.arange(np.flatnonzero(~run.known)[-1] + 1)
+    keep = np.arange(len(voltage_V))
     # Thinned out evenly; the extremes of the path must stay, as they make the memory.
     if len(keep) > _SAMPLES:
-        voltage = run.voltage_V[keep]
-        turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage))) != 0)
+        turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(voltage_V))) != 0)
         even = np.linspace(0, len(keep) - 1, max(2, _SAMPLES - len(turns))).astype(np.int64)
         keep = np.unique(np.concatenate([even, turns]))[: 2 * _SAMPLES]
     pad = (0, 2 * _SAMPLES - len(keep))
-    voltage = np.pad(run.voltage_V[keep], pad, mode="edge")
-    displacement, weight = (np.pad(x, pad) for x in (run.displacement_um[keep], np.full(len(keep), 1 / noise_um)))
+    voltage = np.pad(voltage_V[keep], pad, mode="edge")
+    displacement, weight = (np.pad(x, pad) for x in (displacement_um[keep], np.full(len(keep), 1 / noise_um)))
     return _solve((model, jnp.asarray(voltage), jnp.asarray(displacement), jnp.asarray(weight)))

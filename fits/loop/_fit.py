@@ -19,10 +19,10 @@ from fits.loop._finer import factor_with_plays
 from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._left_over import suggestions
 from fits.loop._moments import RunMean, gather, grid_of
-from fits.loop._parts_agree import check_loops
+from fits.loop._parts_agree import check_loops, left_of
 from fits.loop._path import branches
 from fits.loop._result import FitResult, FitStatus, RunReport
-from fits.loop._run import Progress, Run, command_range_V, prepare_run, simulate_run
+from fits.loop._run import PAST_IS_ESTIMATED, Progress, Run, command_range_V, prepare_run, prepare_runs, simulate_run
 from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
 from fits.stats._metrics import TOLD, WHITE
@@ -66,7 +66,9 @@ def fit(
     holdout
         Fraction at the end of every run that is only predicted, or records that are.
     initial
-        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`.
+        Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. What an unknown one adds is
+        estimated beside the weights where it counts in more than a twentieth of a run's samples, or these are left
+        out where no loop is left beside it.
     loss
         `squares`, or `huber`, to which outliers count less.
     starts, seed
@@ -79,10 +81,7 @@ def fit(
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
 
-    def prepare(record: Record) -> Run:
-        return prepare_run(record, range_V, initial, fraction)
-
-    runs = [prepare(record) for record in records]
+    runs = prepare_runs(records, range_V, initial, fraction)
     if loss == "huber":
         runs = weigh_robustly(runs, progress)
     stroke, tried, trials = choose_grid(runs, levels, progress, alone=True)
@@ -108,14 +107,16 @@ def fit(
     surface = tried.data.grid.surface(columns)
     if found.correlation > WHITE:
         progress("looking for lags and relaxations")
-        remarks += suggestions(runs, surface, stroke, tried.solution.hyper)
+        whole = [run for run in runs if not run.has_past]
+        remarks += suggestions(whole, surface, stroke, tried.solution.hyper) if whole else []
     mean = tried.data.means[0]
     believed = tried.data.grid, found.factor_um, mean.response @ found.factor_um
     if family == "grid" and found.correlation <= WHITE:  # elsewhere blocks say how smooth it is, not the evidence
         progress("looking for plays between the levels")
         believed = factor_with_plays(tried.data, columns, runs, tried.solution.hyper, stroke) or believed
     progress("checking the records")
-    miss, told = check_loops(runs, prepare, surface, stroke, tried.solution.hyper, loss == "huber")
+    again = lambda record, run: prepare_run(record, range_V, initial, fraction, estimated=run.has_past)  # noqa: E731
+    miss, told = check_loops(runs, again, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
     remarks += _of_speed(runs) if miss is not None and miss.far else []
     progress("comparing with the measurement")
@@ -201,12 +202,16 @@ def _with_offset(model: Preisach, offset_um: float) -> Preisach:
 
 
 def _report(found: Estimate, surface: Surface, offset_um: float, run: Run, **figures: Any) -> RunReport:
-    start = run.start
-    if not run.known.all():
+    start, count = run.start, run.of_past
+    if count:
         from fits.loop._estimate_start import estimate_start  # its solver takes long to import
 
-        start = estimate_start(_with_offset(found.model, offset_um), run, found.noise_um)
-    return RunReport.of(run, offset_um + simulate_run(surface, run), offset_um, start, **figures)
+        samples = run.voltage_V[:count], run.displacement_um[:count]
+        start = estimate_start(_with_offset(found.model, offset_um), *samples, found.noise_um)
+    predicted = (
+        run.displacement_um - left_of(surface, run) if run.has_past else offset_um + simulate_run(surface, run)
+    )
+    return RunReport.of(run, predicted, offset_um, start, **figures)
 
 
 def _remarks(runs: list[Run]) -> list[str]:
@@ -214,6 +219,8 @@ def _remarks(runs: list[Run]) -> list[str]:
     for run in runs:
         remarks += list(run.record.warnings)
         lost = int(np.sum(~run.known))
+        if run.has_past:
+            remarks.append(PAST_IS_ESTIMATED.format(run.record.source))
         if lost:
             remarks.append(
                 f"{run.record.source}: the first {lost} samples depend on what the rig went through before; "

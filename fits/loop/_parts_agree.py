@@ -29,11 +29,16 @@ _FEWEST_SAMPLES = 200
 
 
 def check_loops(
-    runs: list[Run], prepare: Callable[[Record], Run], model: Surface, stroke_um: float, hyper: Hyper, robust: bool
+    runs: list[Run],
+    prepare: Callable[[Record, Run], Run],
+    model: Surface,
+    stroke_um: float,
+    hyper: Hyper,
+    robust: bool,
 ) -> tuple[Misfit, list[str]]:
     """Say how far from noise a fitted hysteresis is, and what is wrong with its runs; errors of `disagreements`.
 
-    `prepare` makes a record ready again; `robust` says whether outliers counted less.
+    `prepare` makes a record ready as a run is; `robust` says whether outliers counted less.
     """
     residuals = [left_of(model, run) for run in runs]
     left, remarks = misfits(runs, residuals), remarks_on(runs, residuals, robust)
@@ -158,7 +163,7 @@ def _change_point(run: Run, separate: SeparateFits, rms_um: float) -> list[str]:
 
 
 def delays(
-    runs: Sequence[Run], prepare: Callable[[Record], Run], separate: SeparateFits, left: Sequence[Misfit]
+    runs: Sequence[Run], prepare: Callable[[Record, Run], Run], separate: SeparateFits, left: Sequence[Misfit]
 ) -> list[str]:
     """Look for readings that come late, or before their command, by fitting each run with its voltage shifted."""
     remarks = []
@@ -168,7 +173,7 @@ def delays(
         def residual(samples: float, run: Run = run, interval: float = interval) -> np.ndarray:
             record = run.record
             voltage = np.interp(record.time_s - samples * interval, record.time_s, record.voltage_V)
-            return separate.left(prepare(replace(record, voltage_V=voltage)))
+            return separate.left(prepare(replace(record, voltage_V=voltage), run))
 
         try:
             found = _profile(residual)

@@ -5,6 +5,7 @@ outputs counts operators that share a grid.
 """
 
 import abc
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,7 +16,7 @@ from fits.io._errors import DataError
 from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
 from fits.loop._path import Path
-from fits.loop._prediction import MOST_EXTREMES, PIECE, Prediction, inside, too_deep
+from fits.loop._prediction import MOST_EXTREMES, PIECE, Initial, Prediction, inside, predict_from, too_deep
 from fits.loop._surface import Surface, Visits, basis
 
 INITIAL_STATES = ("unknown", "negative", "positive", "demagnetised")
@@ -77,9 +78,17 @@ class PlainModel(abc.ABC):
     def without_effects(self) -> "PlainModel":
         """The same model without effects of `microid.effects.EFFECTS`; itself where it has none."""
 
-    @abc.abstractmethod
-    def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
+    def predict(
+        self, record: Record, initial: Initial, progress: Callable[[str], None] = lambda _: None
+    ) -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
+        return predict_from(initial, lambda state: self.predict_known(record, state, progress))
+
+    @abc.abstractmethod
+    def predict_known(
+        self, record: Record, initial: Initial, progress: Callable[[str], None] = lambda _: None
+    ) -> Prediction:
+        """The same from a memory that is known."""
 
     @abc.abstractmethod
     def play(self, record: Record, initial: str) -> np.ndarray:
@@ -120,7 +129,9 @@ class PlainLoop(PlainModel):
         saturated = Path.of(*np.array(self.range_V)[:, None])
         return self.offset_um, self.offset_um + float(self.surface.respond(saturated)[0, 0])
 
-    def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
+    def predict_known(
+        self, record: Record, initial: Initial, progress: Callable[[str], None] = lambda _: None
+    ) -> Prediction:
         """See `PlainModel`."""
         record = inside(record, *self.range_V)
         path = self._path(record.voltage_V, initial)
@@ -137,11 +148,11 @@ class PlainLoop(PlainModel):
         """See `PlainModel`: a hysteresis does nothing between the samples."""
         return measured_ranges(replace(program, displacement_um=displacement_um))
 
-    def respond(self, voltage_V: np.ndarray, initial: str) -> np.ndarray:
+    def respond(self, voltage_V: np.ndarray, initial: Initial) -> np.ndarray:
         """Displacement along a voltage, `(n,)`, in um; a `DataError` where it nests too deeply."""
         return self._respond(self._path(voltage_V, initial))
 
-    def _path(self, voltage_V: np.ndarray, initial: str) -> tuple[Path, ...]:
+    def _path(self, voltage_V: np.ndarray, initial: Initial) -> tuple[Path, ...]:
         return path_of(extremes_V(initial, *self.range_V), voltage_V)
 
     def _respond(self, path: tuple[Path, ...]) -> np.ndarray:
@@ -215,15 +226,34 @@ def path_of(before_V: np.ndarray, voltage_V: np.ndarray) -> tuple[Path, ...]:
     return pieces
 
 
-def extremes_V(initial: str, lower_V: float, upper_V: float) -> np.ndarray:
-    """Extremes that a memory begins with, oldest first, by its name; see `microid.Staircase`.
+def extremes_V(initial: Initial, lower_V: float, upper_V: float) -> np.ndarray:
+    """Extremes that a memory begins with, oldest first, by its name or as they are; see `microid.Staircase`.
 
     Negative saturation stands in for an unknown state, as the samples that would show the difference are not used. A
     `DataError` refuses another name.
     """
+    if not isinstance(initial, str):
+        return np.clip(initial, lower_V, upper_V)
     if initial not in INITIAL_STATES:
         raise DataError(f"unknown initial state {initial!r}: choose one of {', '.join(INITIAL_STATES)}")
     if initial == "demagnetised":
         rest, left = (lower_V + upper_V) / 2, 1 - np.arange(_SWINGS) / _SWINGS
         return np.append(rest + left[:, None] * (np.array([lower_V, upper_V]) - rest), rest)
     return np.array([lower_V, upper_V] if initial == "positive" else [lower_V])
+
+
+def memory_named(name: str, report: Mapping[str, Any]) -> Initial:
+    """A memory by its name: a state, or a fitted run, whose estimated memory it begins with.
+
+    The `report` is that of a model file. A `DataError` says what it can be.
+    """
+    if name in INITIAL_STATES:
+        return name
+    runs = report.get("runs", ())
+    for run in runs:
+        if run["source"] in (name, os.path.basename(name)):
+            return tuple(map(float, run["start_extremes_V"]))
+    fitted = f", or a run of the fit ({', '.join(run['source'] for run in runs)})" if runs else ""
+    raise DataError(
+        f"initial memory: expected one of {', '.join(INITIAL_STATES)}{fitted}, found '{name}'; name one of these"
+    )

@@ -1,10 +1,12 @@
-"""What a prediction is, and the programs that none is made of."""
+"""What a prediction is, what it begins from, and the programs that none is made of."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fits.io._errors import DataError
+from fits.io._length import length
 from fits.io._record import Record
 
 # Records pass through compiled functions in pieces of this many samples, and so many extremes at most are remembered
@@ -12,6 +14,10 @@ from fits.io._record import Record
 PIECE, MOST_EXTREMES = 8192, 4096
 # What a readback, or rounding, puts beyond the range of a model, as a share of it: taken as the end.
 _SLACK = 1e-3
+
+
+# The memory before a first sample: its name, or its extremes at the hysteresis in V, oldest first.
+Initial = str | tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -25,6 +31,26 @@ class Prediction:
     displacement_um: np.ndarray
     displacement_sd_um: np.ndarray
     remarks: tuple[str, ...] = ()
+
+
+def predict_from(initial: Initial, predict: Callable[[Initial], Prediction]) -> Prediction:
+    """Predict from a memory, be it `unknown`: then midway between those after both ends of the range.
+
+    No relay adds less than nothing, so that whatever came before is between the two; the standard deviation has that
+    of an even distribution there.
+    """
+    if initial != "unknown":
+        return predict(initial)
+    low, high = predict("negative"), predict("positive")
+    half_um = (high.displacement_um - low.displacement_um) / 2
+    sd_um = np.sqrt(np.maximum(low.displacement_sd_um, high.displacement_sd_um) ** 2 + half_um**2 / 3)
+    widest_um = float(np.abs(half_um).max(initial=0.0))
+    said = (
+        "what the rig went through before is unknown: the prediction is midway between those after the lowest and "
+        f"after the highest voltage, which are up to {length(widest_um)} to either side, and its standard deviation "
+        "has that",
+    )
+    return Prediction(low.displacement_um + half_um, sd_um, (*low.remarks, *(said if widest_um > 0 else ())))
 
 
 def inside(record: Record, lower_V: float, upper_V: float) -> Record:

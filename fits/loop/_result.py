@@ -13,10 +13,10 @@ from fits.io._limits import Ranges, measured_ranges
 from fits.io._record import Record
 from fits.io._summary import AbstractSummary
 from fits.loop._misfit import Misfit
-from fits.loop._prediction import Prediction
+from fits.loop._prediction import Initial, Prediction
 from fits.loop._report import fit_report, preisach_of
 from fits.loop._report_words import describe
-from fits.loop._run import Run
+from fits.loop._run import Run, initial_of
 from fits.loop._uncertainty import AbstractUncertainty
 from fits.stats._metrics import Errors, errors, loop_width_pct
 from microid import Everett, Preisach, Stage, Staircase
@@ -214,9 +214,9 @@ class FitResult(AbstractSummary, Generic[_M]):
         """Say what was fitted, parameters with units, standard deviations and 95 % intervals, and how well."""
         return describe(fit_report(self))
 
-    def predict(self, record: AnyRuns, initial: str = "negative") -> Prediction:
+    def predict(self, record: AnyRuns, initial: Initial | Staircase = "negative") -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
-        return self.uncertainty.predict(self.model, program_given(record), initial)
+        return self.uncertainty.predict(self.model, program_given(record), initial_of(initial))
 
 
 def _pool(parts: Iterable[Errors | None]) -> Errors | None:

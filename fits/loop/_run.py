@@ -18,6 +18,7 @@ from fits.loop._design import Grid, columns_of
 from fits.loop._past import past_columns
 from fits.loop._path import Path
 from fits.loop._plain import extremes_V, path_of
+from fits.loop._prediction import Initial
 from fits.loop._stepped import even_interval_s, refuse_many_steps
 from fits.loop._surface import Surface
 
@@ -31,8 +32,11 @@ _SHORTEST = 4096
 _ALMOST = 1e-2
 # A voltage has been at an end once it comes this close, as a part of the range.
 _AT_END = 0.01
-# Most samples of a record are more than this part.
-_HALF = 0.5
+# A past is estimated that more than this part of a record's samples depends on, in a fit of loops alone, and in one
+# of a stage, whose poles are read off much smaller errors than that of the estimate.
+_SOME, MOST = 0.05, 0.5
+# Said of runs whose past is.
+PAST_IS_ESTIMATED = "{}: what the rig went through before is unknown and estimated beside the rest"
 # Steps between samples that show derivatives well enough.
 _FEW_STEPS = 4
 # Told what is being done, a sentence at a time.
@@ -130,6 +134,12 @@ class Run:
         return np.asarray(self.start.extremes_V)[: int(self.start.count)]
 
     @cached_property
+    def of_past(self) -> int:
+        """Samples up to the last whose output depends on an unknown past, be that estimated or not."""
+        known = known_samples(self.voltage_V, self.lower_V, self.upper_V) if self.has_past else self.known
+        return 0 if known.all() else int(np.flatnonzero(~known)[-1]) + 1
+
+    @cached_property
     def coarser(self) -> "Run":
         """The same in few steps: enough for derivatives, which are directions to move in."""
         return self if self.stride <= _FEW_STEPS else replace(self, stride=_FEW_STEPS)
@@ -188,7 +198,7 @@ class Run:
 def prepare_run(
     record: Record,
     range_V: tuple[float, float],
-    initial: str,
+    initial: Initial,
     holdout: float,
     stride: int = 1,
     gain: float | None = 1.0,
@@ -198,8 +208,8 @@ def prepare_run(
 ) -> Run:
     """Make a record ready whose command stays in a range; a `DataError` if nothing of it is left to fit.
 
-    The memory before the first sample is `initial`, one of `INITIAL_STATES`; a fraction at the end is held out.
-    `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
+    The memory before the first sample is `initial`, one of `INITIAL_STATES` or extremes; a fraction at the end is
+    held out. `gain` is None for a stage without a hysteresis, which no past is unknown of. Samples that are not
     `usable` are not known ones, shape `(n,)`; nor are those with an unknown past, unless that is `estimated`: then
     less is held out where the run goes farther at its end than before. For the others see `Run`.
     """
@@ -229,30 +239,37 @@ def prepare_run(
     return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, has_past)
 
 
+def prepare_runs(records: Sequence[Record], range_V: tuple[float, float], initial: str, holdout: float) -> list[Run]:
+    """Make the records of a hysteresis alone ready, errors of `prepare_run`; see `pasts_to_estimate`."""
+    pasts = (False,) * len(records)
+    if initial == "unknown":
+        pasts = pasts_to_estimate(records, range_V, holdout, _SOME)
+    pairs = zip(records, pasts, strict=True)
+    return [prepare_run(one, range_V, initial, holdout, estimated=past) for one, past in pairs]
+
+
 def pasts_to_estimate(
-    records: Sequence[Record], range_V: tuple[float, float], holdout: float, most: bool = False
+    records: Sequence[Record], range_V: tuple[float, float], holdout: float, least: float | None = None
 ) -> tuple[bool, ...]:
     """Of which records, all in their order, the unknown past is estimated beside the rest.
 
-    Of all, or where that leaves no whole loop, and with `most` in any case, of those only that would lose most of
-    their samples to it. The samples that are fitted must go up and down through the range where no unknown past
-    reaches them: otherwise nothing would be left beside it.
+    Of all, or of those that would lose more than the `least` part of their samples to it. What it adds stays as it is
+    while the voltage stays within what it has reached: there the samples that are fitted must go up and down through
+    the range, as otherwise nothing would be left beside it.
     """
-    known = [known_samples(record.voltage_V, *range_V) for record in records]
-    losing = tuple(float(np.mean(one)) < _HALF for one in known)
-    for chosen in (losing,) if most else ((True,) * len(records), losing):
-        up_V = down_V = 0.0
-        for record, own, estimated in zip(records, known, chosen, strict=True):
-            voltage, near = record.voltage_V, _AT_END * (range_V[1] - range_V[0])
-            highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
-            both = (highest >= voltage.max() - near) & (lowest <= voltage.min() + near)
-            swept = both if estimated else own.copy()
-            swept[len(record) - round(holdout * len(record)) :] = False
-            moves_V = np.diff(voltage)[swept[1:]]
-            up_V, down_V = up_V + float(moves_V[moves_V > 0].sum()), down_V - float(moves_V[moves_V < 0].sum())
-        if min(up_V, down_V) >= (1 - 2 * _AT_END) * (range_V[1] - range_V[0]):
-            return chosen
-    return (False,) * len(records)
+    inside_V = np.concatenate([_moves_inside_V(record.voltage_V, holdout) for record in records])
+    up_V, down_V = float(inside_V[inside_V > 0].sum()), -float(inside_V[inside_V < 0].sum())
+    if min(up_V, down_V) < (1 - 2 * _AT_END) * (range_V[1] - range_V[0]):
+        return (False,) * len(records)
+    known = (known_samples(record.voltage_V, *range_V) for record in records)
+    return tuple(least is None or float(np.mean(~one)) > least for one in known)
+
+
+def _moves_inside_V(voltage_V: np.ndarray, holdout: float) -> np.ndarray:
+    """Steps of what is not held out of a voltage that end within what it has reached before."""
+    fitted = voltage_V[: len(voltage_V) - round(holdout * len(voltage_V))]
+    highest, lowest = np.maximum.accumulate(fitted)[:-1], np.minimum.accumulate(fitted)[:-1]
+    return np.diff(fitted)[(fitted[1:] <= highest) & (fitted[1:] >= lowest)]
 
 
 def _as_far_as_it_goes(voltage_V: np.ndarray) -> int:
@@ -272,12 +289,19 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
     return min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
 
 
-def initial_state(name: str, lower_V: float, upper_V: float) -> m.Staircase:
-    """Make the memory before a record from its name; see `extremes_V`."""
-    return staircase(extremes_V(name, lower_V, upper_V), _EXTREMES)
+def initial_state(initial: Initial, lower_V: float, upper_V: float) -> m.Staircase:
+    """Make the memory before a record from its name, or its extremes; see `extremes_V`."""
+    return staircase(extremes_V(initial, lower_V, upper_V), _EXTREMES)
 
 
-def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: str = "unknown") -> np.ndarray:
+def initial_of(given: Initial | m.Staircase) -> Initial:
+    """A memory as it is given in Python: by its name, or as that before a run of a fit."""
+    if isinstance(given, m.Staircase):
+        return tuple(np.asarray(given.extremes_V)[: int(given.count)].tolist())
+    return given
+
+
+def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: Initial = "unknown") -> np.ndarray:
     """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES`.
 
     At an end of the range every relay is in a known state, unless it cannot be switched back within the range. Short

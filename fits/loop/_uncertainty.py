@@ -10,7 +10,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid
 from fits.loop._plain import Perturbations
-from fits.loop._prediction import Prediction, inside
+from fits.loop._prediction import Initial, Prediction, inside, predict_from
 from fits.loop._run import Run, prepare_run, simulate_run
 from microid import Preisach, Stage
 
@@ -28,8 +28,12 @@ class AbstractUncertainty(eqx.Module):
         """Standard deviation of the predicted displacement of a run, shape `(n,)`."""
 
     @abstractmethod
-    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+    def predict_known(self, model: Preisach | Stage, record: Record, initial: Initial) -> Prediction:
+        """Predict the displacement of a voltage program from a memory that is known; see `fits.predict`."""
+
+    def predict(self, model: Preisach | Stage, record: Record, initial: Initial) -> Prediction:
         """Predict the displacement of a voltage program; see `fits.predict`."""
+        return predict_from(initial, lambda state: self.predict_known(model, record, state))
 
 
 class Uncertainty(AbstractUncertainty):
@@ -52,7 +56,7 @@ class Uncertainty(AbstractUncertainty):
         densities, discrepancy_um = self.grid.densities(np.asarray(self.columns_um).T), float(self.discrepancy_um)
         return Perturbations(*densities, self.grid.ends_V, np.asarray(self.offset_um), discrepancy_um).sd_um(run.path)
 
-    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+    def predict_known(self, model: Preisach | Stage, record: Record, initial: Initial) -> Prediction:
         if not isinstance(model, Preisach):
             raise DataError("the uncertainty is that of a hysteresis, and the model is a stage: fit it again")
         range_V = float(model.density.lower_V), float(model.density.upper_V)

@@ -18,8 +18,9 @@ from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit, correlated
 from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitError, FitResult, FitStatus, RunReport
-from fits.loop._run import Progress, Run, pasts_to_estimate, prepare_run
+from fits.loop._run import MOST, PAST_IS_ESTIMATED, Progress, Run, pasts_to_estimate, prepare_run
 from fits.loop._stepped import refuse_many_steps
+from fits.stage._before import memory_before
 from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._plan import Plan
@@ -36,8 +37,6 @@ from fits.stage._solve import Problem, Solved
 from fits.stage._steps import present_problem, refine_problem, start_problem, starts_as_it_is
 from fits.stage._uncertainty import Precision, estimates
 from fits.stats._metrics import TOLD
-
-_PAST = "{}: what the rig went through before is unknown and estimated beside the rest; most samples depend on it"
 
 
 def default_stage(hold: m.Hold = "first") -> m.Stage:
@@ -91,11 +90,11 @@ def fit_stage(
         Number of switching voltages; chosen from the slow runs by default.
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
-        that are held out, too; theirs is unknown where each fitted run has its own. What an unknown one adds is left
-        out, as in `fit`, or estimated beside the rest in a run that would lose most of its samples to it, where other
-        samples hold whole loops. With a hysteresis inside the mechanics all but `unknown` mean at rest; after an
-        unknown past, such as a steady state, the samples are left out that depend on where the stage was at rest
-        before.
+        that are held out, too; theirs is unknown where each fitted run has its own. What an unknown one adds is
+        estimated beside the rest in a run that would lose most of its samples to it, where samples hold loops within
+        what has been reached, and left out elsewhere. With a hysteresis inside the mechanics all but `unknown` mean
+        at rest; after an unknown past, such as a steady state, the samples are left out that depend on where the
+        stage was at rest before.
     holdout, loss, progress
         See `fit`, as for what is returned.
     """
@@ -138,7 +137,7 @@ def fit_stage(
         remedy = "name the right one among the columns, as in time_s=NAME[ms]"
         summary = Alternative.in_unit(summary, unit[1]).widen(summary, unit[0], remedy)
     pasts = [run.record.source for run in runs if run.has_past]
-    said = [_PAST.format(", ".join(pasts))] if pasts else []
+    said = [PAST_IS_ESTIMATED.format(", ".join(pasts))] if pasts else []
     summary = replace(summary, remarks=(*solved.problem.remarks, *said, *summary.remarks))
     return completed(summary, solved, (*records, *aside), loss)
 
@@ -190,7 +189,7 @@ def solve_stage(
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
     stage = default_stage() if stage is None else stage
     if not estimated and free_grid(stage) is not None and set(states) == {"unknown"}:
-        estimated = pasts_to_estimate(records, range_V, fraction, most=True)
+        estimated = pasts_to_estimate(records, range_V, fraction, MOST)
     ahead = stage.parts[: place_of_hysteresis(stage)]
     if stage.hold == "zero" and not any(isinstance(part, m.Driver) for part in ahead):
         raise DataError(
@@ -274,9 +273,12 @@ def _with_offset(stage: m.Stage, offset_um: float) -> m.Stage:
 def _report(stage: m.Stage, run: Run, **figures: Any) -> RunReport:
     # A run that was only predicted still has an offset of its own.
     counted = run if run.fitted.any() else replace(run, fitted=run.known)
-    predicted = run.displacement_um - residual_of(stage, counted)
-    offset = float(np.mean((predicted - simulate_stage(stage, counted))[counted.fitted]))
-    return RunReport.of(run, predicted, offset, run.start, **figures)
+    predicted, alone = run.displacement_um - residual_of(stage, counted), simulate_stage(stage, counted)
+    # What an estimated past adds is nothing once it counts no more, at the last sample at the latest.
+    settled = counted.fitted & (np.arange(len(alone)) >= run.of_past) if run.has_past else counted.fitted
+    offset = float(np.mean((predicted - alone)[settled])) if settled.any() else float((predicted - alone)[-1])
+    noise = float(np.std((run.displacement_um - predicted)[counted.fitted]))
+    return RunReport.of(run, predicted, offset, memory_before(stage, run, alone + offset, noise), **figures)
 
 
 def unseen_directions(information: np.ndarray, names: Sequence[str], relative: np.ndarray) -> tuple[str, ...]:

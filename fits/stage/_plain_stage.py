@@ -17,7 +17,7 @@ from fits.io._threads import one_thread
 from fits.loop._path import Path
 from fits.loop._plain import PlainLoop, PlainModel, extremes_V
 from fits.loop._plain_file import ODD, array_of, fields_of, plain_loop, read_directions, read_law
-from fits.loop._prediction import Prediction, inside
+from fits.loop._prediction import Initial, Prediction, inside
 from fits.loop._stepped import intervals, stepped
 from fits.loop._surface import Surface
 from fits.stage._declared import tools
@@ -96,7 +96,9 @@ class PlainStage(PlainModel):
         return self if len(linear) == len(self.parts) else replace(self, parts=linear, uncertainty=None)
 
     @_in_numpy
-    def predict(self, record: Record, initial: str, progress: Callable[[str], None] = lambda _: None) -> Prediction:
+    def predict_known(
+        self, record: Record, initial: Initial, progress: Callable[[str], None] = lambda _: None
+    ) -> Prediction:
         """See `PlainModel`."""
         record = inside(record, *self.range_V)
         sd_um = np.full(len(record), np.nan)
@@ -124,7 +126,7 @@ class PlainStage(PlainModel):
         return joined([found, {"displacement": (float(between.min()), float(between.max()))}])
 
     def _respond(
-        self, parts: Sequence[PlainPart], record: Record, initial: str, steps: int, as_run: bool = True
+        self, parts: Sequence[PlainPart], record: Record, initial: Initial, steps: int, as_run: bool = True
     ) -> np.ndarray:
         """Displacement at so many steps between samples, `((n - 1) steps + 1,)`, complex where a parameter is."""
         interval_s, command_V = stepped(record, steps, self.hold, as_run)
@@ -138,12 +140,14 @@ class PlainStage(PlainModel):
         command = _NumpySignal(command_V[:, None], command_V[:1], self.hold)
         return through((part for part in parts if part.ahead), interval_s, command)
 
-    def _switched(self, voltage: _NumpySignal, initial: str) -> _NumpySignal:
+    def _switched(self, voltage: _NumpySignal, initial: Initial) -> _NumpySignal:
         """What the hysteresis makes of what it sees."""
         displacement = self.law.respond(np.append(voltage.before, voltage.values[:, 0]), initial)[:, None]
         return voltage._replace(values=displacement[1:], before=displacement[0])
 
-    def _sd_um(self, known: Directions, record: Record, initial: str, progress: Callable[[str], None]) -> np.ndarray:
+    def _sd_um(
+        self, known: Directions, record: Record, initial: Initial, progress: Callable[[str], None]
+    ) -> np.ndarray:
         """Standard deviation of the displacement, `(n,)`: to first order in all perturbations."""
         slope_um = np.zeros((len(record), len(known.free)))
         for k in np.flatnonzero(np.any(known.coordinates, axis=0)):
@@ -157,7 +161,7 @@ class PlainStage(PlainModel):
             first += len(columns_um)
         return np.sqrt(np.concatenate(found) + known.discrepancy_um**2)
 
-    def _slope_um(self, place: int, name: str, at: tuple[int, ...], record: Record, initial: str) -> np.ndarray:
+    def _slope_um(self, place: int, name: str, at: tuple[int, ...], record: Record, initial: Initial) -> np.ndarray:
         """Derivative of the displacement by the coordinate of one parameter, `(n,)`."""
         part, parts = self.parts[place], list(self.parts)
         value = np.array(part.values[name], dtype=complex)
@@ -165,7 +169,7 @@ class PlainStage(PlainModel):
         parts[place] = replace(part, values={**part.values, name: value[()]})
         return np.imag(self._respond(parts, record, initial, self.substeps)[:: self.substeps]) / _TINY
 
-    def _columns_um(self, known: Directions, record: Record, initial: str) -> Iterator[np.ndarray]:
+    def _columns_um(self, known: Directions, record: Record, initial: Initial) -> Iterator[np.ndarray]:
         """What perturbations of the hysteresis do to the displacement, some samples at a time, `(samples, k)`."""
         interval_s, command_V = stepped(record, self.substeps, self.hold, as_run=True)
         voltage = self._ahead(self.parts, interval_s, command_V)

@@ -17,7 +17,7 @@ from fits.io._kept import kept
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._past import past_columns
-from fits.loop._prediction import inside
+from fits.loop._prediction import Initial, inside
 from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare_run
 
 # Relative size of what is too small to be seen.
@@ -152,7 +152,7 @@ def gain_ahead(stage: m.Stage) -> float | None:
     place = place_of_hysteresis(stage)
     if place is None:
         return None
-    gain = float(_static_gain(stage.parts[:place]))
+    gain = float(static_gain(stage.parts[:place]))
     if not 0 < gain < math.inf:
         raise DataError(
             f"the static gain ahead of {stage.names[place]!r} is {gain:g}, expected a positive one: turn the sign of "
@@ -163,7 +163,8 @@ def gain_ahead(stage: m.Stage) -> float | None:
 
 
 @kept
-def _static_gain(parts: Sequence[Any]) -> Float[Array, ""]:
+def static_gain(parts: Sequence[Any]) -> Float[Array, ""]:
+    """Gain at rest of the linear ones among some parts."""
     linear = (part.static_gain for part in parts if isinstance(part, m.AbstractLinear))
     return math.prod(linear, start=jnp.ones(()))
 
@@ -241,11 +242,17 @@ def prepare_again(stage: m.Stage, records: Sequence[Record], initial: str, holdo
     return [prepare_run(record, range_V, *settings) for record in records]
 
 
-def prepare_program(stage: m.Stage, record: Record, initial: str) -> tuple[m.Stage, Run]:
+def prepare_program(stage: m.Stage, record: Record, initial: Initial) -> tuple[m.Stage, Run]:
     """Make a voltage program ready for a stage, and the stage for intervals that are divided already.
 
-    A `DataError` if it leaves the range that the stage was fitted on, or lacks a column that the stage depends on.
+    A `DataError` if it leaves the range that the stage was fitted on, lacks a column that the stage depends on, or
+    begins from another memory than its hysteresis can.
     """
+    law = hysteresis_of(stage)
+    if law is not None and initial != "negative" and not isinstance(m.innermost(law), m.Preisach):
+        raise DataError(
+            f"a {type(m.innermost(law)).__name__} begins at rest, with nothing remembered: state no initial memory"
+        )
     range_V = range_of(stage)
     record = inside(record, *range_V)
     needed = {name for part in stage.parts if isinstance(part, m.effects.AbstractEffect) for name in part.needs}

@@ -12,18 +12,18 @@ from fits.io._given import AnyRuns, program_given
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
 from fits.loop._grid import BELIEF_LEVELS
-from fits.loop._prediction import Prediction
+from fits.loop._prediction import Initial, Prediction, predict_from
 from fits.loop._prior import Hyper, definite, interpolation, roughness
 from fits.loop._result import ParameterEstimate
-from fits.loop._run import Run
+from fits.loop._run import Run, initial_of
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
 from fits.stage._chain import Chain, offsets_out
 from fits.stage._moments import along, linearise
-from fits.stage._run import as_stage, place_of_hysteresis, prepare_program, simulate_stage
+from fits.stage._run import as_stage, nuisance_columns, place_of_hysteresis, prepare_program, simulate_stage
 from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
 from fits.stats._metrics import TWO_SIDED_95, WHITE
 from fits.stats._noise import correlation_samples, fast_length, shared_square
-from microid import Preisach, Stage
+from microid import Preisach, Stage, Staircase
 
 # Precision, in scaled coordinates, that stands in for none.
 NO_PRECISION = 1e-8
@@ -47,7 +47,7 @@ class StageUncertainty(AbstractUncertainty):
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
         return self._predicted(_stage(model), run).displacement_sd_um
 
-    def predict(self, model: Preisach | Stage, record: Record, initial: str) -> Prediction:
+    def predict_known(self, model: Preisach | Stage, record: Record, initial: Initial) -> Prediction:
         return self._predicted(*prepare_program(_stage(model), record, initial))
 
     def _predicted(self, stage: Stage, run: Run) -> Prediction:
@@ -97,8 +97,11 @@ class Precision:
         directions = np.split(self.answer, [self.chain.size])
         here, out = (jnp.asarray(self.solved.z), jnp.asarray(self.solved.columns_um)), []
         for run, share in zip(self.solved.runs, self.solved.weighing.shares, strict=True):
-            slope = along(self.chain, *here, run, directions).T
-            slope = slope - np.average(slope, axis=1, weights=run.fit_weight)[:, None]
+            slope = along(self.chain, *here, run, directions)
+            # What nuisance parameters take up is not learnt from.
+            nuisance = np.asarray(nuisance_columns(self.solved.stage, run.coarser.samples))[: len(slope)]
+            root = np.sqrt(run.fit_weight)[:, None]
+            slope = (slope - nuisance @ np.linalg.lstsq(root * nuisance, root * slope, rcond=None)[0]).T
             # The other half of the weight goes to the residual that this is multiplied by.
             out.append(slope * np.sqrt(run.fit_weight) * share / self.variance)
         return out
@@ -189,14 +192,20 @@ def sandwich(influence: np.ndarray, residual_um: np.ndarray, fitted: np.ndarray)
 
 
 def predict(
-    model: Any, record: AnyRuns, initial: str = "negative", *, uncertainty: AbstractUncertainty | None = None
+    model: Any,
+    record: AnyRuns,
+    initial: Initial | Staircase = "negative",
+    *,
+    uncertainty: AbstractUncertainty | None = None,
 ) -> Prediction:
     """Predict the displacement of a voltage program, with its uncertainty.
 
     The model is a `Preisach` or a `Stage`, with an `uncertainty` beside it or not, or a fit or a model file with its
     own, or the name of such a file; where there is none the standard deviations are NaN. The program is a record, or
-    what `read_table` takes; its displacement, if any, is not looked at. The memory before its first sample is
-    `negative`, `positive` or `demagnetised`.
+    what `read_table` takes; its displacement, if any, is not looked at. Its `initial` memory is
+    `negative`, `positive`, `demagnetised` or `unknown`, or one that a fit has estimated, the `start` of one of its
+    runs, or its extremes in V, oldest first. Of an unknown one the prediction is midway between those after both ends
+    of the range, and the standard deviation has that of an even distribution between the two.
 
     A `DataError` says that the voltage leaves the range that the model was fitted on, that a stage has an effect of
     another column, which the program lacks, or that the uncertainty is that of another kind of model.
@@ -205,10 +214,16 @@ def predict(
 
     record = program_given(record)
     model, uncertainty = model_given(model, uncertainty)
+    before = initial_of(initial)
     if uncertainty is not None:
-        return uncertainty.predict(model, record, initial)
-    stage, run = prepare_program(as_stage(model), record, initial)
-    return Prediction(simulate_stage(stage, run), np.full(len(record), np.nan), run.record.warnings)
+        return uncertainty.predict(model, record, before)
+    whole = as_stage(model)
+
+    def played(state: Initial) -> Prediction:
+        stage, run = prepare_program(whole, record, state)
+        return Prediction(simulate_stage(stage, run), np.full(len(record), np.nan), run.record.warnings)
+
+    return predict_from(before, played)
 
 
 def draw_plants(
