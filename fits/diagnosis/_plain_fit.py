@@ -17,6 +17,7 @@ from fits.diagnosis._residual_tests import repeats_in
 from fits.diagnosis._score import Probe, Scored, applicable, law_of, probes_of, scales_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._threads import map_in_threads
+from fits.stage._run import residual_of
 from microid import Hold
 from microid.effects import EFFECTS, AbstractEffect, Scales
 
@@ -204,20 +205,42 @@ class PlainFit:
         large = gained(found) > max(least, thresholds.minor_share * best)
         return shared(found) if large and beside(found) > (1 - off) * best else taken
 
-    def may_step(self, thresholds: Thresholds) -> bool:
-        """Whether more than noise is left, and part of that is late, so that all commands may go in steps.
+    def may_be_held(self, thresholds: Thresholds) -> bool:
+        """Whether more than noise is left, and is late, or a run held out is predicted better in steps."""
+        if {*self.holds} == {"zero"} or float(self.left @ self.left) <= (1 + _NOISE) * len(self.left):
+            return False
+        return self.foretold_in_steps or self.delay_drop(self.left) > thresholds.other_hold_z**2
 
-        A resonance fitted beside lines may have taken up most of how late they are.
+    @property
+    def foretold_in_steps(self) -> bool:
+        """Whether a run held out is predicted better in steps, though those that were fitted run in another way."""
+        aside = {run.hold for run in self.regression.baseline.aside}
+        return "zero" in aside and "zero" not in self.holds
+
+    @cached_property
+    def missed_um2(self) -> float:
+        """Sum of squares by which runs held out are missed."""
+        baseline = self.regression.baseline
+        each = ((residual_of(baseline.stage, run), run.known) for run in baseline.aside)
+        return sum(float(np.sum(left[known] ** 2)) for left, known in each)
+
+    def explains_more(self, other: "PlainFit") -> bool:
+        """Whether less is left beside the best effect than another fit leaves.
+
+        Where runs held out go as here, and not as those of the other, it is enough that about as much is left, and
+        that they are predicted better.
         """
-        far = float(self.left @ self.left) > (1 + _NOISE) * len(self.left)
-        most = max(thresholds.other_hold_z**2, (1 - thresholds.model_error) * self.largest_z() ** 2)
-        return "zero" not in self.holds and far and self.delay_drop(self.left) > most
+        here = self.in_noise_of(other)
+        noise, off = len(here.left), self.thresholds.model_error
+        rest, there = (float(one.left @ one.left) - one.largest_z() ** 2 for one in (here, other))
+        if rest < there - max(self.thresholds.other_hold_z**2, off * (there - noise)):
+            return True
+        return other.foretold_in_steps and rest < (1 + off) * there and self.missed_um2 < (1 - off) * other.missed_um2
 
-    def leaves_less(self, other: "PlainFit", beside: bool = True) -> bool:
-        """Whether less is left here than another fit leaves, `beside` the best effect or without any."""
+    def leaves_less(self, other: "PlainFit") -> bool:
+        """Whether less is left here than another fit leaves."""
         left = self.left_in(other.faults)
-        explained = other.largest_z() ** 2 if beside else 0.0
-        return float(left @ left) < float(other.left @ other.left) - explained
+        return float(left @ left) < float(other.left @ other.left)
 
     def left_beside_lag(self) -> float:
         """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""

@@ -121,56 +121,60 @@ def prepare_diagnosis(
         found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
         return PlainFit(regression, found, reading.thresholds)
 
-    def lagging(here: PlainFit, holds: Holds, said: tuple[str, ...]) -> tuple[PlainFit, tuple[str, ...]]:
-        """A stage with a driver and no mechanics in place of another, where that explains more."""
+    def lagging(here: PlainFit, holds: Holds) -> tuple[PlainFit, str]:
+        """A stage with a driver and no mechanics in place of another, where that explains more, and what to say."""
         if not (may_be_of_driver(here, reading.thresholds) and has_time()):
-            return here, said
+            return here, ""
         progress("fitting the plain stage again, with a driver and no mechanics")
         drop_programs(records)
         other = fitted(holds, here.regression.baseline.with_driver_alone(lag_of(here)))
         if not is_of_driver(other, here, reading.thresholds):
             behind = other.regression.baseline.dynamic and not here.regression.baseline.dynamic
-            return here, (*said, BEHIND) if behind else said
-        [(_, driver)] = named_parts(other.regression.baseline.stage, Driver)
-        return other, (*said, _DRIVER.format(float(driver.time_constant_s)))
+            return here, BEHIND if behind else ""
+        return other, _DRIVER
 
     progress(Step.BASELINE)
     holds = tuple(map(_hold_of_plateaus, records))
     here = fitted(holds)
     drop_programs(records)
     progress(Step.PROBES)
+    words = ""
     if not here.regression.baseline.dynamic:
-        here, said = lagging(here, holds, said)
+        here, words = lagging(here, holds)
     if here.regression.baseline.dynamic:
         rings = here.regression.baseline.resonance_Hz is not None
         holds = here.better_holds(reading.thresholds)
-        steps = holds == here.holds and here.may_step(reading.thresholds)
-        if (steps or holds != here.holds) and not has_time():
+        if holds != here.holds and not has_time():
             said = (*said, _NOT_ASKED)
-        elif steps or holds != here.holds:
+        elif holds != here.holds:
             progress("fitting the plain stage again, its command in another way between samples")
             drop_programs(records)
-            if steps:
-                other = fitted(IN_STEPS * len(records), None if rings else here.regression.baseline.problem)
-                here = other if other.leaves_less(here) else here
-            else:
-                other = fitted(holds, here.regression.baseline.problem)
-                lines = IN_LINES * len(records)
-                if "smooth" in holds and lines not in (here.holds, holds) and has_time():
-                    # Levels looked like steps, which are as far from lines as from curves.
-                    plain = fitted(lines, other.regression.baseline.problem)
-                    other = plain if plain.outdoes(other) else other
-                # What comes late at a sensor looks like a command that does so between samples.
-                here = here if here.outdoes(other) else other
+            other = fitted(holds, here.regression.baseline.problem)
+            lines = IN_LINES * len(records)
+            if "smooth" in holds and lines not in (here.holds, holds) and has_time():
+                # Levels looked like steps, which are as far from lines as from curves.
+                plain = fitted(lines, other.regression.baseline.problem)
+                other = plain if plain.outdoes(other) else other
+            # What comes late at a sensor looks like a command that does so between samples.
+            here = here if here.outdoes(other) else other
             if here is other and has_time() and (own := here.better_holds(reading.thresholds)) != here.holds:
                 # What this stage leaves is less, and shows of each run how it goes.
                 progress("fitting the plain stage again, the command of each run in its own way between samples")
                 other = fitted(own, here.regression.baseline.problem)
-                here = other if other.leaves_less(here, False) else here
+                here = other if other.leaves_less(here) else here
             drop_programs(records)
         if rings:
-            here, said = lagging(here, here.holds, said)
+            here, words = lagging(here, here.holds)
+        if here.may_be_held(reading.thresholds) and has_time():
+            progress("fitting the plain stage again, its command held between samples")
+            other = fitted(IN_STEPS * len(records), here.regression.baseline.problem)
+            here = other if other.explains_more(here) else here
+            drop_programs(records)
+        if words == _DRIVER:
+            [(_, driver)] = named_parts(here.regression.baseline.stage, Driver)
+            words = _DRIVER.format(float(driver.time_constant_s))
         said = (*said, *_of_holds(here.regression.baseline))
+    said = (*said, *filter(None, [words]))
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if (
