@@ -1,6 +1,7 @@
 """Runs of a stage that are not what they seem: each is refused, or named, and its intervals own up to it."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from _wrong_records import TRUTH, bench, delayed, in_ms, said, stuck, thinned, w
 from scipy import signal
 
 import fits
+from fits.stage._delay import WithoutDelays
 
 LEVELS = 16
 ALARMS = ("BEFORE", "AFTER", "stuck", "outliers", "another unit", "no resonance")
@@ -136,6 +138,15 @@ def triangles(rng, frequency_Hz, rate_Hz=10_000.0, cycles=6):
     time = np.arange(n) / rate_Hz
     reading = np.round(out + 2e-4 * rng.standard_normal(n), 4)
     return fits.Record(time, voltage[::fine], reading, source=f"triangle_{frequency_Hz:g}Hz.csv")
+
+
+@pytest.mark.parametrize(
+    ("late", "held"), [((0.55, 0.63), True), ((0.5,), True), ((0.55, 1.4), False), ((-0.5,), False), ((0.1,), False)]
+)
+def test_readings_half_a_sample_late_are_said_to_be_those_of_a_held_command(late, held):
+    delays = tuple(SimpleNamespace(samples=one) for one in late)
+    remedy = WithoutDelays(delays, None).remedy
+    assert ("in steps" in (remedy or "")) == held
 
 
 @pytest.mark.parametrize("others", [0.0, 1.5])

@@ -31,6 +31,11 @@ _FARTHEST_SAMPLES = 64
 _NARROWED, _BESIDE = 6, 4.0
 # What a stage leaves, in % of the stroke, that is more than creep and its like would be.
 GROSS_PCT = 2.0
+_HELD = (
+    "a command that is held between its samples comes half a sample late: fit it in steps, or check the time stamps"
+)
+# In samples, where it looks like that.
+_ABOUT_HALF = 0.3, 0.75
 REMEDY = "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
 
 
@@ -116,14 +121,21 @@ class WithoutDelays:
         """Say what the columns of the runs look like."""
         return "; ".join(f"{one.run.record.source}: {one.words()}" for one in self.delays)
 
+    @property
+    def remedy(self) -> str | None:
+        """What to do where the command is perhaps held, and every run late by that."""
+        low, high = _ABOUT_HALF
+        return _HELD if all(low < one.samples < high for one in self.delays) else None
+
     def widen(self, fit: FitResult[Stage]) -> FitResult[Stage]:
         """Name the delays, and widen intervals by what they did; a `DataError` if that leaves nothing to say."""
         other, said = Alternative.of(self.solved), self.words()
         for p, v in zip(fit.parameters, other.values, strict=True):
             if abs(v - p.value) > 0.5 * min(abs(v), abs(p.value)):
                 moved = f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
-                raise DataError(f"{said}, and {moved}: {REMEDY}")
-        return other.widen(fit, said, "check columns and time stamps, or the delay of the sensor's electronics")
+                raise DataError(f"{said}, and {moved}: {self.remedy or REMEDY}")
+        usual = "check columns and time stamps, or the delay of the sensor's electronics"
+        return other.widen(fit, said, self.remedy or usual)
 
 
 def fit_without_delays(

@@ -109,7 +109,7 @@ def fit_stage(
         refuse_undersampled(solved.stage, runs, left)
     if undelayed is not None and (found.failure is not None or simplified):
         beside = BESIDE_A_LAG if max(one.delay_s for one in undelayed.delays) > 0 else ""
-        raise DataError(f"{undelayed.words()}, and no fit was found with that: {REMEDY}{beside}")
+        raise DataError(f"{undelayed.words()}, and no fit was found with that: {undelayed.remedy or REMEDY}{beside}")
     if found.failure is not None:
         raise found.failure
     gross = worst(left)
