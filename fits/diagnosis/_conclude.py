@@ -116,7 +116,7 @@ def conclude(
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * unit_um < rounding_um)
     cyclic = (
-        not rounded
+        not (rounded or any(card_of(cause.name).origin for cause in kept))
         and repeated.z > thresholds.cycles
         and repeated.drop > thresholds.minor_share * max(misfit.excess, repeated.drop)
     )

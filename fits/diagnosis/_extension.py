@@ -27,6 +27,8 @@ from microid.effects import AbstractEffect
 _ROUNDS = 6
 # Of the fit of what a run held out whole had gone through before, at most.
 _TRIED = 20
+# Parts of a period from which its beginning in such a run is fitted.
+_PARTS = 12
 
 
 @dataclass(frozen=True)
@@ -157,23 +159,32 @@ def _with_past(
 ) -> np.ndarray:
     """What the extended stage leaves of a run held out whole, shape `(n,)`, what effects remember fitted to it.
 
-    What a rig went through before a run is no more known of this than of those that were fitted.
+    What a rig went through before a run is no more known of this than of those that were fitted, nor how far from
+    where a period of the position began: a sensor has an offset in each run, and so has an unknown past.
     """
-    own = [(at, name) for at, effect in enumerate(effects) for name in effect.history]
+    # As of the fitted runs, where the past is stated nothing of it is fitted.
+    own = [(at, name) for at, effect in enumerate(effects) for name in effect.history if run.moving]
+    begins = [(at, effect.origin[0]) for at, effect in enumerate(effects) if effect.origin]
 
-    def left(past: np.ndarray) -> np.ndarray:
+    def left(values: np.ndarray) -> np.ndarray:
         acting = list(effects)
-        for (at, name), value in zip(own, past, strict=True):
+        for (at, name), value in zip([*own, *begins], values, strict=True):
             acting[at] = replace(acting[at], **{name: jnp.asarray(value)})
         change_um = behind.respond_in(k, acting) - behind.plain[k]
         return left_of(run, nuisance, plain_um + change_um, run.known)
 
-    nothing = np.zeros(len(own))
-    # As of the fitted runs, where the past is stated nothing of it is fitted.
-    if not own or not run.moving:
-        return left(nothing)
+    def missed(values: np.ndarray) -> float:
+        return float(np.sum(left(values)[run.known] ** 2))
+
+    best = np.array([0.0] * len(own) + [float(getattr(effects[at], name)) for at, name in begins])
+    for place, (at, _) in enumerate(begins, len(own)):
+        turn = np.zeros(len(best))
+        turn[place] = float(getattr(effects[at], effects[at].origin[1]))
+        best = min((best + part * turn for part in np.arange(_PARTS) / _PARTS), key=missed)
+    if not len(best):
+        return left(best)
     scale_um = float(np.std(run.displacement_um))
-    return left(least_squares(lambda past: left(past)[run.known] / scale_um, nothing, max_nfev=_TRIED).x)
+    return left(least_squares(lambda values: left(values)[run.known] / scale_um, best, max_nfev=_TRIED).x)
 
 
 def left_of(run: Run, nuisance: np.ndarray, response_um: np.ndarray, using: np.ndarray) -> np.ndarray:

@@ -47,6 +47,7 @@ class CyclicError(AbstractEffect):
         "wavelength; of encoders, at their grating period (estimate)"
     )
     view: ClassVar[View] = "position"
+    origin: ClassVar[tuple[str, ...]] = ("centre_um", "period_um")
     cosine_um: Float[Array, " 2"] = param(unit="um", scale=0.01)
     sine_um: Float[Array, " 2"] = param(unit="um", scale=0.01)
     period_um: Float[Array, ""] = param(unit="um", scale=1.0, lower=0.0)
