@@ -115,7 +115,10 @@ def fit(
         progress("looking for plays between the levels")
         believed = factor_with_plays(tried.data, columns, runs, tried.solution.hyper, stroke) or believed
     progress("checking the records")
-    again = lambda record, run: prepare_run(record, range_V, initial, fraction, estimated=run.has_past)  # noqa: E731
+
+    def again(record: Record, run: Run) -> Run:
+        return prepare_run(record, range_V, initial, fraction, estimated=run.has_past)
+
     miss, told = check_loops(runs, again, surface, stroke, tried.solution.hyper, loss == "huber")
     offsets = [mean.displacement_um - float(mean.response @ columns) for mean in tried.data.means]
     remarks += _of_speed(runs) if miss is not None and miss.far else []
