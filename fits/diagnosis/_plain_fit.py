@@ -219,13 +219,13 @@ class PlainFit:
 
     @cached_property
     def missed_um2(self) -> float:
-        """Sum of squares by which runs held out are missed."""
+        """Sum of squares by which all that is held out is missed."""
         baseline = self.regression.baseline
-        each = ((residual_of(baseline.stage, run), run.known) for run in baseline.aside)
-        return sum(float(np.sum(left[known] ** 2)) for left, known in each)
+        parts = [*((run, run.held_out) for run in baseline.runs), *((run, run.known) for run in baseline.aside)]
+        return sum(float(np.sum(residual_of(baseline.stage, run)[which] ** 2)) for run, which in parts)
 
     def explains_more(self, other: "PlainFit") -> bool:
-        """Whether less is left beside the best effect than another fit leaves.
+        """Whether less is left beside the best effect than another fit leaves, and nothing is predicted worse.
 
         Where runs held out go as here, and not as those of the other, it is enough that about as much is left, and
         that they are predicted better.
@@ -233,7 +233,12 @@ class PlainFit:
         here = self.in_noise_of(other)
         noise, off = len(here.left), self.thresholds.model_error
         rest, there = (float(one.left @ one.left) - one.largest_z() ** 2 for one in (here, other))
-        if rest < there - max(self.thresholds.other_hold_z**2, off * (there - noise)):
+        if self.missed_um2 > (1 + off) * other.missed_um2:
+            return False
+        # Of noise alone nothing would leave less.
+        if there > (1 + _NOISE) * noise and rest < there - max(
+            self.thresholds.other_hold_z**2, off * (there - noise)
+        ):
             return True
         return other.foretold_in_steps and rest < (1 + off) * there and self.missed_um2 < (1 - off) * other.missed_um2
 
