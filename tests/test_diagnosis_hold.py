@@ -219,6 +219,10 @@ def test_steps_are_taken_that_leave_less_beside_the_best_effect_or_predict_bette
     assert not PlainFit.explains_more(fitted_to(("zero",), 5.1, 100.0, missed_um2=9.8), told)
     assert not PlainFit.explains_more(fitted_to(("zero",), 5.5, 100.0, missed_um2=2.0), told)
     assert not PlainFit.explains_more(steps, replace_aside(told))
+    # A delay that is one leaves much beside its tangent, and what was held out is predicted worse in steps.
+    assert not PlainFit.explains_more(fitted_to(("zero",), 7.0, 190.0, missed_um2=1.1), lines)
+    # Of noise alone nothing would leave less.
+    assert not PlainFit.explains_more(fitted_to(("zero",), 1.0, 10.0), fitted_to(("first",), 5.0, 199.0))
 
 
 def replace_aside(fit):
