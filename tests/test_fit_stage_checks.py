@@ -9,6 +9,7 @@ from _wrong_records import TRUTH, bench, delayed, in_ms, said, stuck, thinned, w
 from scipy import signal
 
 import fits
+from fits.stage._checks import refuse_slopes, speed_Hz
 from fits.stage._delay import WithoutDelays
 
 LEVELS = 16
@@ -53,6 +54,22 @@ def test_a_clean_rig_gets_no_such_remark(runs):
     assert result.misfit.noise_um == pytest.approx(0.05, rel=0.15)
     assert result.summary().startswith("left over")
     holds_the_truth(result)
+
+
+def test_what_rings_reaches_farther_and_is_no_other_rig():
+    time_s, natural = np.arange(6000) * 1e-4, 2 * np.pi * 300
+    mode = [natural**2], [1, 2 * 0.015 * natural, natural**2]
+    stairs_V = np.repeat([10.0, 70, 30, 90, 20, 60, 40, 80, 15, 85, 25, 65], 500)
+    # As fast, but beyond the mode.
+    lines_V = 50 - 36 * np.cos(2 * np.pi * 5 * time_s) + 4 * np.sin(2 * np.pi * 900 * time_s)
+    moved_um = [signal.lsim(mode, 0.1 * v, time_s, X0=[0, v[0] / 10 / natural**2])[1] for v in (stairs_V, lines_V)]
+    assert np.ptp(moved_um[0]) > 1.5 * np.ptp(moved_um[1])
+    records = [
+        fits.Record(time_s, v, um, source=f"{k}.csv")
+        for k, (v, um) in enumerate(zip((stairs_V, lines_V), moved_um, strict=True))
+    ]
+    assert speed_Hz(records[0]) == pytest.approx(speed_Hz(records[1]), rel=0.45)
+    refuse_slopes(records)
 
 
 @pytest.mark.study

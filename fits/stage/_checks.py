@@ -40,11 +40,13 @@ def refuse_slopes(records: Sequence[Record]) -> None:
     """Refuse, in a `DataError`, slow runs over one range of voltage that move differently far."""
     spans = [float(np.ptp(record.voltage_V)) for record in records]
     found = zip(records, spans, map(_moved_um, records), map(speed_Hz, records), strict=True)
-    full = [(um / span, speed, one.source) for one, span, um, speed in found if span > _WHOLE * max(spans)]
-    for (high, fast, one), (low, slow, other) in permutations(full, 2):
+    full = [(record, um / span, speed) for record, span, um, speed in found if span > _WHOLE * max(spans)]
+    for (one, high, fast), (other, low, slow) in permutations(full, 2):
+        # Where a run rings it reaches farther, but not on average.
+        ratio = min(high / low, _slope(one) / max(_slope(other), 1e-300))
         # What is faster may move less far because of the dynamics, which are not known yet.
-        if high > (1 + _REFUSED) * low and max(fast, slow) < 1.5 * min(fast, slow):
-            raise DataError(_not_one_rig(one, other, high / low))
+        if ratio > 1 + _REFUSED and max(fast, slow) < 1.5 * min(fast, slow):
+            raise DataError(_not_one_rig(one.source, other.source, ratio))
 
 
 def _moved_um(record: Record) -> float:
@@ -54,6 +56,12 @@ def _moved_um(record: Record) -> float:
     first = max(int(np.argmax(share <= 1 - _WHOLE)), int(np.argmax(share >= _WHOLE)))
     again = first if np.ptp(share[first:]) > _WHOLE else 0
     return float(np.ptp(displacement_um[again:]))
+
+
+def _slope(record: Record) -> float:
+    """Displacement per voltage, least squares."""
+    voltage_V, displacement_um = record.voltage_V, np.asarray(record.displacement_um)
+    return float(np.cov(voltage_V, displacement_um)[0, 1] / np.var(voltage_V, ddof=1))
 
 
 def speed_Hz(record: Record) -> float:
