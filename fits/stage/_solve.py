@@ -189,11 +189,11 @@ def solve_chain(
             return settled
         if (cost := _cost(runs, weighing)) < best - _FALLS:
             best, last = cost, number
-        if accept_best and number >= last + _PATIENCE:
+        if (rough or accept_best) and number >= last + _PATIENCE:
             # Smoothness and noise take turns.
             break
         rounds.append((weighing.noise_um, hyper))
-        if number >= last + _PATIENCE and not rough:
+        if number >= last + _PATIENCE:
             # For an answer both are held at their means then, so that there is one objective, which falls.
             turns = rounds[last + 1 : last + 1 + _PATIENCE]
             noises, hypers = zip(*turns, strict=True)
@@ -235,9 +235,9 @@ def solve_chain(
             damping *= _FACTOR
             if damping > _HIGHEST:
                 break
-        if damping > _HIGHEST and accept_best:
-            break
-        if damping > _HIGHEST and not rough:
+        if damping > _HIGHEST:
+            if rough or accept_best:
+                break
             if chain.grid is None:
                 raise FitError(FitStatus.NOT_STATIONARY)
             # Where columns meet their bounds the linearisation promises what no step however short has.
