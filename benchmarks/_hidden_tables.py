@@ -60,6 +60,7 @@ SAME: dict[tuple[str, str], dict[str, Callable[[Row, Row], float]]] = {
     # Not timestamp_jitter: on the bench no sample is late by half a period, which fast runs would be.
     ("transport_delay", ""): {"delay_s": _same("delay_s")},
     ("voltage_dependent_capacitance", ""): {"slope": _same("change_share")},
+    ("zero_shift", ""): {"shift_um": _same("shift_um")},
 }
 
 

@@ -33,7 +33,7 @@ PAIRS = (
     ("transport_delay", "backlash"),
     ("creep", "sensor_nonlinearity"),
     ("mains_hum", "driver_saturation"),
-    ("creep", "offset_jumps"),
+    ("creep", "zero_shift"),
 )
 _NONE_PER_EFFECT = 4
 # A worker keeps what it has compiled, and is replaced before that fills the memory or its mappings.

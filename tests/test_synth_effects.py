@@ -71,9 +71,9 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
 
 
 def test_the_library_and_what_is_outside_of_it():
-    assert len(ds.EFFECTS) == 29
+    assert len(ds.EFFECTS) == 30
     assert not set(ds.EFFECTS) & set(ds.OUTSIDE)
-    assert {"offset_jumps", "wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
+    assert {"wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
 
 
 @pytest.mark.parametrize("kind", ["plays", "relays"])
@@ -141,7 +141,7 @@ def test_lost_samples_show_after_the_first_of_them(seed):
     np.testing.assert_allclose(fast[-40:-3], whole[-37:], atol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["mains_hum", "floor_vibration", "burst_disturbance", "offset_jumps"])
+@pytest.mark.parametrize("name", ["mains_hum", "floor_vibration", "burst_disturbance", "zero_shift"])
 def test_disturbances_do_not_ask_what_is_commanded(name, seed):
     hidden = bench(name, seed=seed, noise_um=NOISE_UM)
     plain = without(hidden)

@@ -59,13 +59,11 @@ def cyclic_error(
     return reading_um + amplitude_um * np.sin(2 * math.pi * reading_um / period_um)
 
 
-@effect("sensor", "height_um", usual=0.1, limit=5.0, outside=True)
-def offset_jumps(reading_um: FloatArray, run: Situation, *, height_um: float, jumps: int = 6) -> FloatArray:
-    """Something slips: the zero of the reading jumps by about `height_um` (um) at random instants."""
+@effect("sensor", "shift_um", usual=0.3, limit=5.0)
+def zero_shift(reading_um: FloatArray, run: Situation, *, shift_um: float, jumps: int = 1) -> FloatArray:
+    """Something slips: the zero of the reading jumps by `shift_um` (um) at so many random instants of a run."""
     instants_s = np.sort(run.rng.uniform(0.05, 0.95, jumps)) * run.duration_s
-    heights_um = height_um * run.rng.standard_normal(jumps)
-    levels_um = np.concatenate([[0.0], np.cumsum(heights_um)])
-    return reading_um + levels_um[np.searchsorted(instants_s, run.time_s)]
+    return reading_um + shift_um * np.searchsorted(instants_s, run.time_s)
 
 
 @effect("sensor", "gain", usual=0.01, limit=0.3, outside=True, between={"correlations": POSITIVE})

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
-from fits.diagnosis._effects import Bench
+from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._joint_fit import State, fit_from_poles, fit_jointly
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
@@ -19,7 +20,7 @@ from microid.effects import EFFECTS, AbstractEffect
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 5
-# Part of a record before which nothing is said to happen in it.
+# Part of a record, at its start and its end, in which nothing is said to happen in it.
 _INSIDE = 0.02
 # So many are fitted at a time.
 _TOGETHER = 2
@@ -93,7 +94,6 @@ def compare_rivals(
     alone = not model.is_noise(projector, chance_z) and all(found.laws[-1].at_bound(found.x[-1]) for found in noise)
     fitted: dict[type[AbstractEffect], Refit] = {}
     for one, found in fits if has_time() else ():
-        scored = [other for other in scores if other.name == one.name]
         if found.cost - least < _PROMISING * (model.cost - least):
             found = relocate(bench, projector, found, first)
         # From the poles of a plain stage a lag may shrink to none.
@@ -105,7 +105,7 @@ def compare_rivals(
         if not (stands_out or improvement_z(before, projector.held_out(found.change_um)) >= thresholds.worse_z):
             continue
         most = first + laws if has_time() else 0
-        found = _add_occurrences(bench, projector, found, scored, most, thresholds)
+        found = _add_occurrences(bench, projector, found, scores, most, thresholds)
         if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
             fitted[one.form] = found
     rivals = [Rival.of(projector, one) for one in fitted.values()]
@@ -149,10 +149,18 @@ def _is_possible(projector: Projector, found: Refit, alone: bool, thresholds: Th
 def _add_occurrences(
     bench: Bench, projector: Projector, found: Refit, scored: Sequence[Scored], most: int, thresholds: Thresholds
 ) -> Refit:
-    """Add occurrences of what is counted, as a loss of samples, while that pays: several look like a drift."""
-    first = len(found.laws) - 1
-    while found.laws[-1].form.counted and len(found.laws) < most:
-        more = _one_more(bench, projector, found, scored)
+    """Add occurrences of what happens at an instant, as a loss, while that pays: several look like a drift.
+
+    Runs have their own: what one of them alone shows, another law of the same effect says of another run. `scored`
+    are all effects: where another explains more of the rest than one more occurrence, that is asked first.
+    """
+    first, name = len(found.laws) - 1, found.laws[-1].form.name
+    own = [one for one in scored if one.name == name]
+    while is_occurrence(found.laws[-1]) and len(found.laws) < most:
+        left = score(projector, [one.probe for one in scored], found.residual, found.basis()).each
+        if max(left, key=lambda one: one.z).name != name:
+            break
+        more = _one_more(bench, projector, found, own)
         if not (more.determined(thresholds.determined_z) and has_occurred(bench, more)):
             break
         if more.criterion(projector.count) > found.criterion(projector.count) - thresholds.tie:
@@ -160,7 +168,7 @@ def _add_occurrences(
         for _ in range(first, len(more.laws)):
             # Alone it stood for all of them: each in turn is put where the others leave most.
             laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
-            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), scored)
+            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
             more = min(more, moved, key=lambda one: one.cost)
         found = relocate(bench, projector, more, first)
     return found
@@ -252,19 +260,26 @@ def _ranked(
     return sorted(best.values(), key=lambda one: one.criterion)
 
 
-def has_occurred(bench: Bench, model: Refit, place: int = -1) -> bool:
-    """Whether what is counted in sampling intervals is nearer to one than to none in some run, for a law.
+def is_occurrence(law: Law) -> bool:
+    """Whether it is one of several things that may happen in a run, each at an instant."""
+    return law.form.repeats and "after_s" in law.form.__dataclass_fields__
 
-    It must happen inside that run: what goes on from the first samples is a lag of the whole run, and no loss in it.
+
+def has_occurred(bench: Bench, model: Refit, place: int = -1) -> bool:
+    """Whether what happens at an instant does so in some run, for a law: what is counted nearer to once than never.
+
+    It must happen inside that run: what goes on from the first samples is a lag or an offset of the whole run.
     """
     law, x = model.laws[place], model.x[place]
-    found = not law.form.counted
+    found = not is_occurrence(law)
     for run, one in enumerate(bench.prepared):
-        interval_s = float(np.median(np.diff(one.run.record.time_s)))
-        effect = law.effect(x, run)
-        inside = float(getattr(effect, "after_s", np.inf)) > _INSIDE * one.run.record.duration_s
-        counted = any(abs(float(getattr(effect, name))) > interval_s / 2 for name in law.form.counted)
-        found = found or (inside and counted)
+        interval_s, duration_s = float(np.median(np.diff(one.run.record.time_s))), one.run.record.duration_s
+        effect: Any = law.effect(x, run)
+        if not found:
+            inside = _INSIDE * duration_s < float(effect.after_s) < (1 - _INSIDE) * duration_s
+            counted = law.form.counted
+            once = not counted or any(abs(float(getattr(effect, name))) > interval_s / 2 for name in counted)
+            found = inside and once
     return found
 
 

@@ -255,7 +255,9 @@ def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: floa
     order = [*(i for i in range(len(laws)) if i != k), k]
     owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
     basis = replace(model, tangent=model.tangent[:, owner != k]).basis()
-    found = _fit(bench, projector, [laws[i] for i in order], [x[i] for i in order], len(laws) - 1, basis, 2)
+    ordered = [laws[i] for i in order], [x[i] for i in order]
+    # What is no better after the first round is not followed.
+    found = _fit(bench, projector, *ordered, len(laws) - 1, basis, 2, model.cost)
     return _in_order(found, order)
 
 

@@ -113,6 +113,10 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
             break
         if frozenset((*taken, best.name)) in known:
             break
+        ahead = whole + (thresholds.most_causes - len(taken)) * best.drop
+        if taken and ahead < thresholds.minor_share * (search.plain.cost - projector.count + projector.freedom):
+            # With as many more that explain as much, most of the misfit would be unexplained: none would be named.
+            break
         top = best.z
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         if bench.baseline.dynamic:
