@@ -268,7 +268,8 @@ def test_the_class_of_a_cause_lists_none_that_is_named_beside_it(monkeypatch):
     ]
     laws = [SimpleNamespace(form=forms[name], size=1, effects=lambda x: x) for name in rivals]
     model = SimpleNamespace(covariance=lambda: np.eye(2), laws=laws, x=[np.ones(1), np.ones(1)])
-    bench = SimpleNamespace(respond=lambda _: [np.ones(3)], plain=[np.zeros(3)])
+    run = SimpleNamespace(run=SimpleNamespace(record=SimpleNamespace(time_s=np.arange(3.0))))
+    bench = SimpleNamespace(respond=lambda _: [np.ones(3)], plain=[np.zeros(3)], prepared=[run])
     projector = SimpleNamespace(join=np.concatenate, off=lambda x: x, masks=[np.ones(3, bool)], count=3)
     monkeypatch.setattr(_findings, "profile_likelihood", lambda *_: [])
     monkeypatch.setattr(_findings, "_parameters", lambda *_: ())

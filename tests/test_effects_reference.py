@@ -242,7 +242,10 @@ def test_slow_effects_in_closed_form(rng):
         ("thermal_drift", "temperature"): ((0.2, 7.0), 0.2 * follow),
         ("mount_relaxation", ""): ((0.3, 7.0), 0.3 * decay),
         ("mount_relaxation", "logarithmic"): ((0.3, 7.0), 0.3 * np.log10(1 + time / 7)),
-        ("zero_shift", ""): ((0.3, 7.0, 2.4), 0.3 * np.interp(time, [7, 7 + np.hypot(2.4, interval)], [0, 1])),
+        ("zero_shift", ""): (
+            (0.3, 7.02, 0.07),
+            0.3 * np.interp(time, [7.02, 7.02 + np.hypot(0.07, interval)], [0, 1]),
+        ),
         ("cross_coupling", ""): ((0.01,), 0.01 * other),
         ("cross_coupling", "quadratic"): ((1e-4,), 1e-4 * other**2),
         ("thermal_gain", "temperature"): (

@@ -9,8 +9,9 @@ from test_diagnosis_decisions import misfit
 
 from fits import Record
 from fits.diagnosis import _misfit
-from fits.diagnosis._comparison import has_occurred, model_error
+from fits.diagnosis._comparison import model_error
 from fits.diagnosis._explanation import Cause, Selection
+from fits.diagnosis._occurrences import has_occurred
 from fits.diagnosis._thresholds import Thresholds
 from microid.effects.dropped_samples import DroppedSamples
 

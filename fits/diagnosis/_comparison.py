@@ -3,14 +3,14 @@
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
-from fits.diagnosis._effects import Bench, Law
+from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State, fit_from_poles, fit_jointly
+from fits.diagnosis._occurrences import add_occurrences, has_occurred, is_abrupt
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
+from fits.diagnosis._refit import Refit, refit_beside, relocate
 from fits.diagnosis._score import Probe, Scored, best_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._threads import map_in_threads
@@ -20,8 +20,6 @@ from microid.effects import EFFECTS, AbstractEffect
 # So many effects, the best by their scores, are fitted to choose among them, in so many forms each where they have no
 # strength; the baseline is fitted again beside so many of the best.
 _LEADERS, _FORMS, _NEAREST = 5, 2, 5
-# Part of a record, at its start and its end, in which nothing is said to happen in it.
-_INSIDE = 0.02
 # So many are fitted at a time.
 _TOGETHER = 2
 # Scores below this share of the best are not worth a fit. The instant of an effect is not searched for, and the
@@ -99,13 +97,14 @@ def compare_rivals(
         # From the poles of a plain stage a lag may shrink to none.
         begins_elsewhere = bench.baseline.dynamic and bool(one.form.lag)
         possible = _is_possible(projector, found, alone, thresholds) and has_occurred(bench, found)
+        possible = possible and is_abrupt(bench, projector, found, thresholds)
         if not (possible or begins_elsewhere):
             continue
         stands_out = one.robust_z > thresholds.determined_z or not len(before) or begins_elsewhere
         if not (stands_out or improvement_z(before, projector.held_out(found.change_um)) >= thresholds.worse_z):
             continue
         most = first + laws if has_time() else 0
-        found = _add_occurrences(bench, projector, found, scores, most, thresholds)
+        found = add_occurrences(bench, projector, found, scores, most, thresholds)
         if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
             fitted[one.form] = found
     rivals = [Rival.of(projector, one) for one in fitted.values()]
@@ -144,40 +143,6 @@ def _is_possible(projector: Projector, found: Refit, alone: bool, thresholds: Th
         return False
     alone = alone and found.is_noise(projector, thresholds.chance_z)
     return found.determined(thresholds.determined_z, False, alone)
-
-
-def _add_occurrences(
-    bench: Bench, projector: Projector, found: Refit, scored: Sequence[Scored], most: int, thresholds: Thresholds
-) -> Refit:
-    """Add occurrences of what happens at an instant, as a loss, while that pays: several look like a drift.
-
-    Runs have their own: what one of them alone shows, another law of the same effect says of another run. `scored`
-    are all effects: where another explains more of the rest than one more occurrence, that is asked first.
-    """
-    first, name = len(found.laws) - 1, found.laws[-1].form.name
-    own = [one for one in scored if one.name == name]
-    while is_occurrence(found.laws[-1]) and len(found.laws) < most:
-        left = score(projector, [one.probe for one in scored], found.residual, found.basis()).each
-        if max(left, key=lambda one: one.z).name != name:
-            break
-        more = _one_more(bench, projector, found, own)
-        if not (more.determined(thresholds.determined_z) and has_occurred(bench, more)):
-            break
-        if more.criterion(projector.count) > found.criterion(projector.count) - thresholds.tie:
-            break
-        for _ in range(first, len(more.laws)):
-            # Alone it stood for all of them: each in turn is put where the others leave most.
-            laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
-            moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
-            more = min(more, moved, key=lambda one: one.cost)
-        found = relocate(bench, projector, more, first)
-    return found
-
-
-def _one_more(bench: Bench, projector: Projector, model: Refit, scored: Sequence[Scored]) -> Refit:
-    left = score(projector, [one.probe for one in scored], model.residual, model.basis()).each
-    more = refit_beside(bench, projector, model, max(left, key=lambda one: one.z))
-    return relocate(bench, projector, more, len(model.laws))
 
 
 def _ranked(
@@ -258,29 +223,6 @@ def _ranked(
     for one in sorted(out, key=lambda one: (one.end is None, one.criterion)):
         best.setdefault(one.name, one)
     return sorted(best.values(), key=lambda one: one.criterion)
-
-
-def is_occurrence(law: Law) -> bool:
-    """Whether it is one of several things that may happen in a run, each at an instant."""
-    return law.form.repeats and "after_s" in law.form.__dataclass_fields__
-
-
-def has_occurred(bench: Bench, model: Refit, place: int = -1) -> bool:
-    """Whether what happens at an instant does so in some run, for a law: what is counted nearer to once than never.
-
-    It must happen inside that run: what goes on from the first samples is a lag or an offset of the whole run.
-    """
-    law, x = model.laws[place], model.x[place]
-    found = not is_occurrence(law)
-    for run, one in enumerate(bench.prepared):
-        interval_s, duration_s = float(np.median(np.diff(one.run.record.time_s))), one.run.record.duration_s
-        effect: Any = law.effect(x, run)
-        if not found:
-            inside = _INSIDE * duration_s < float(effect.after_s) < (1 - _INSIDE) * duration_s
-            counted = law.form.counted
-            once = not counted or any(abs(float(getattr(effect, name))) > interval_s / 2 for name in counted)
-            found = inside and once
-    return found
 
 
 def indistinguishable(

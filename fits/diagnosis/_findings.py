@@ -59,6 +59,7 @@ def causes_of(
     weight: defaultdict[str, float] = defaultdict(float)
     bench, projector = beside.bench, beside.projector
     covariance, at = model.covariance(), 0
+    interval_s = max(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
     whole, beside_it = max(sum(cause.drop for cause in causes), 1e-300), {cause.name for cause in causes}
     for number, (cause, law, x) in enumerate(zip(causes, model.laws, model.x, strict=True)):
         block = covariance[at : at + law.size, at : at + law.size]
@@ -71,7 +72,7 @@ def causes_of(
         share = part * explained[0]
         weight[cause.name] += part * explained[1]
         along = profile_likelihood(bench, projector, model, number, block, has_time)
-        parameters = _parameters(law, x, block, along)
+        parameters = _parameters(law, x, block, along, interval_s)
         if cause.name in found:
             first, count = found[cause.name], [one.name for one in causes[: number + 1]].count(cause.name)
             more = (replace(one, name=f"{one.name}, number {count}") for one in parameters)
@@ -137,11 +138,16 @@ def _rms(signal_um: Sequence[np.ndarray], projector: Projector) -> float:
 
 
 def _parameters(
-    law: Law, x: np.ndarray, covariance: np.ndarray, along: Sequence[tuple[float, np.ndarray]]
+    law: Law,
+    x: np.ndarray,
+    covariance: np.ndarray,
+    along: Sequence[tuple[float, np.ndarray]],
+    interval_s: float,
 ) -> tuple[ParameterEstimate, ...]:
     """Values in their units: of each run in which the effect shows where runs differ, the others by their place.
 
-    Intervals reach as far to either side as the profile `along` coordinates that are so many deviations away each.
+    Intervals reach as far to either side as the profile `along` coordinates that are so many deviations away each;
+    of what happens at once, no farther than to the next sample, at `interval_s`.
     """
     runs = len(law.maps) if law.form.per_run and law.each.any() else 1
     shared: list[ParameterEstimate] = []
@@ -161,6 +167,9 @@ def _parameters(
             # What went on before a run is no property of the rig.
             if info.path in law.form.history or (run and not differs):
                 continue
+            if law.form.rise and info.spec.unit == "s":
+                # Between samples nothing shows of it.
+                below[place], above[place] = np.minimum((below[place], above[place]), interval_s)
             for at in range(place.start, place.stop):
                 name = info.path if place.stop - place.start == 1 else f"{info.path}[{at - place.start}]"
                 value, less, more = float(values[at]), float(below[at]), float(above[at])

@@ -238,10 +238,10 @@ def refit_around(bench: Bench, projector: Projector, model: Refit, which: int, l
     order = [which, *(k for k in range(len(laws)) if k != which)]
     nothing = np.zeros((len(projector.residual), 0))
     found = _fit(bench, projector, [laws[k] for k in order], [x[k] for k in order], 1, nothing, rounds)
-    return _in_order(found, order)
+    return in_order(found, order)
 
 
-def _in_order(found: Refit, order: Sequence[int]) -> Refit:
+def in_order(found: Refit, order: Sequence[int]) -> Refit:
     """Laws and coordinates in the order from which they were taken."""
     back = np.argsort(order)
     return replace(found, laws=tuple(found.laws[k] for k in back), x=tuple(found.x[k] for k in back))
@@ -258,7 +258,7 @@ def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: floa
     ordered = [laws[i] for i in order], [x[i] for i in order]
     # What is no better after the first round is not followed.
     found = _fit(bench, projector, *ordered, len(laws) - 1, basis, 2, model.cost)
-    return _in_order(found, order)
+    return in_order(found, order)
 
 
 def _fit(

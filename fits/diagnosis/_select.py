@@ -9,14 +9,15 @@ from fits.diagnosis._comparison import (
     compare_rivals,
     confusable_z,
     criterion,
-    has_occurred,
     indistinguishable,
     leaders,
     model_error,
 )
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Cause, Explanation, Search, Selection, best_of_ends, with_equals
+from fits.diagnosis._forms import in_best_forms
 from fits.diagnosis._joint_fit import is_smoothness_confirmed, refine, relearn_noise
+from fits.diagnosis._occurrences import has_occurred
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._score import Probe
@@ -148,8 +149,11 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
             if one.family.p(z / sigma) >= false_alarm or rival.criterion > one.criterion:
                 continue
             if taken and is_worse(before, rival.held_out, thresholds.worse_z, thresholds.model_error):
-                vetoed = True
-                continue
+                end = in_best_forms(*end, search.probes)
+                held = end[1].held_out(end[-1].change_um)
+                if is_worse(before, held, thresholds.worse_z, thresholds.model_error):
+                    vetoed = True
+                    continue
             same = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)
             rivals = tuple(replace(other, end=None) for other in same)
             behind = tuple(other.name for other in same if other.criterion < rival.criterion)

@@ -147,6 +147,9 @@ class AbstractEffect(AbstractPart):
     lag, relaxation
         For a lag of the first order of the readings, and for one relaxation behind the hysteresis, the parameter that
         is its time constant in s, as slow loops are fitted with both; empty for all others.
+    rise
+        For what happens at once, the parameter that is how long that took, as what takes long is a drift; empty for
+        all others.
     origin
         For what comes again with the position, the parameters that are where it begins and how far it is to the next:
         a run that was not fitted has an offset of its own. Empty for all others.
@@ -186,6 +189,7 @@ class AbstractEffect(AbstractPart):
     delay: ClassVar[str] = ""
     lag: ClassVar[str] = ""
     relaxation: ClassVar[str] = ""
+    rise: ClassVar[str] = ""
     origin: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

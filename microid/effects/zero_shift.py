@@ -38,6 +38,7 @@ class ZeroShift(AbstractEffect):
     strength: ClassVar[tuple[str, ...]] = ("shift_um",)
     per_run: ClassVar[bool] = True
     repeats: ClassVar[bool] = True
+    rise: ClassVar[str] = "rise_s"
     fingerprint: ClassVar[str] = "The residual jumps at one instant and stays there, whatever the command does."
     confusions: ClassVar[tuple[str, ...]] = ("mount_relaxation", "thermal_drift")
     experiment: ClassVar[str] = "The same record again with nothing touched: a jump comes elsewhere, or not at all."
