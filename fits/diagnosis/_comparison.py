@@ -100,7 +100,7 @@ def compare_rivals(
         possible = possible and is_abrupt(bench, projector, found, thresholds)
         if not (possible or begins_elsewhere):
             continue
-        stands_out = one.robust_z > thresholds.determined_z or not len(before) or begins_elsewhere
+        stands_out = one.robust_z > thresholds.chance_z or not len(before) or begins_elsewhere
         if not (stands_out or improvement_z(before, projector.held_out(found.change_um)) >= thresholds.worse_z):
             continue
         most = first + laws if has_time() else 0
@@ -142,7 +142,7 @@ def _is_possible(projector: Projector, found: Refit, alone: bool, thresholds: Th
     if not all(np.all(np.isfinite(change)) for change in found.change_um):
         return False
     alone = alone and found.is_noise(projector, thresholds.chance_z)
-    return found.determined(thresholds.determined_z, False, alone)
+    return found.determined(thresholds.chance_z, False, alone)
 
 
 def _ranked(
@@ -179,7 +179,7 @@ def _ranked(
         return far
 
     def is_shown(one: Rival) -> bool:
-        return not one.form.lag or one.refit.determined(thresholds.determined_z, False, quiet)
+        return not one.form.lag or one.refit.determined(thresholds.chance_z, False, quiet)
 
     def ends_of(place: int, far: bool) -> tuple[list[State], list[State]]:
         """Fits from poles, and the joint one, of which there is none where it is far behind."""
@@ -259,16 +259,16 @@ def gain_ahead(left: Sequence[Scored], causes: Collection[str], explained: float
     """
     bar = max(explained, 0.0) ** 0.5
     further = [
-        one for one in left if one.name not in causes and one.z > bar * model_error(one.name, causes, thresholds)
+        one for one in left if one.name not in causes and one.z > bar * further_error(one.name, causes, thresholds)
     ]
     return max((one.drop for one in further), default=0.0)
 
 
-def model_error(name: str, causes: Collection[str], thresholds: Thresholds) -> float:
+def further_error(name: str, causes: Collection[str], thresholds: Thresholds) -> float:
     """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
     if any(form.flexible for form in EFFECTS if form.name == name):
         return thresholds.confused_error
     own = {other for form in EFFECTS if form.name == name for other in form.confusions}
     if any(f.name in causes and (name in f.confusions or f.name in own) for f in EFFECTS):
         return thresholds.confused_error
-    return thresholds.model_error
+    return thresholds.further_error

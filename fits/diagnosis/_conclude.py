@@ -156,7 +156,7 @@ def conclude(
         remarks.append(_OWN_LAG)
     if not late:
         remarks = [one for one in remarks if one != BEHIND]
-    remarks += _before_the_runs(model, thresholds.determined_z)
+    remarks += _before_the_runs(model, thresholds.chance_z)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)

@@ -153,7 +153,7 @@ def _one_floor(bands: list[Band], thresholds: Thresholds) -> Band:
     """
     seen = []
     for k, one in enumerate(bands):
-        others = [b for j, b in enumerate(bands) if j != k and not b.played and b.z > thresholds.determined_z]
+        others = [b for j, b in enumerate(bands) if j != k and not b.played and b.z > thresholds.chance_z]
         seen.append(replace(one, played=one.played and not any(one.agrees(other) for other in others)))
     strong_z = thresholds.strong_z
     return max(seen, key=lambda one: (not one.mains and not one.played, one.z > strong_z and not one.alone, one.z))

@@ -66,30 +66,33 @@ def is_abrupt(bench: Bench, projector: Projector, model: Refit, thresholds: Thre
 def add_occurrences(
     bench: Bench, projector: Projector, found: Refit, scored: Sequence[Scored], most: int, thresholds: Thresholds
 ) -> Refit:
-    """Add occurrences of what happens at an instant, as a loss, while that pays: several look like a drift.
+    """Add occurrences of what happens at an instant while that pays, so that there are so many laws at most.
 
-    Runs have their own: what one of them alone shows, another law of the same effect says of another run. `scored`
-    are all effects: where another explains more of the rest than one more occurrence, that is asked first.
+    Several losses look like a drift, which has to be told from them. Of what jumps one is added for each other run:
+    many jumps follow anything, and more are asked for beside other effects. `scored` are all of these: where another
+    explains more of the rest than one more occurrence, that is asked first.
     """
-    first, name = len(found.laws) - 1, found.laws[-1].form.name
-    own = [one for one in scored if one.name == name]
+    first, form = len(found.laws) - 1, found.laws[-1].form
+    name, own = form.name, [one for one in scored if one.name == form.name]
+    if not form.counted:
+        most = min(most, first + len(bench.prepared))
     while is_occurrence(found.laws[-1]) and len(found.laws) < most:
         left = score(projector, [one.probe for one in scored], found.residual, found.basis()).each
         if max(left, key=lambda one: one.z).name != name:
             break
         more = _one_more(bench, projector, found, own)
-        if not (more.determined(thresholds.determined_z) and has_occurred(bench, more)):
+        if not (more.determined(thresholds.chance_z) and has_occurred(bench, more)):
             break
         if not is_abrupt(bench, projector, more, thresholds):
             break
         if more.criterion(projector.count) > found.criterion(projector.count) - thresholds.tie:
             break
-        for _ in range(first, len(more.laws)):
+        for _ in range(first, len(more.laws) if form.counted else first):
             # Alone it stood for all of them: each in turn is put where the others leave most.
             laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
             moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
             more = min(more, moved, key=lambda one: one.cost)
-        found = relocate(bench, projector, more, first)
+        found = relocate(bench, projector, more, first) if form.counted else more
     return found
 
 

@@ -9,9 +9,9 @@ from fits.diagnosis._comparison import (
     compare_rivals,
     confusable_z,
     criterion,
+    further_error,
     indistinguishable,
     leaders,
-    model_error,
 )
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Cause, Explanation, Search, Selection, best_of_ends, with_equals
@@ -100,7 +100,7 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
     explained = one.modelled(search.plain) ** 0.5
     bars = {
         scored.form: (whole**0.5 if scored.form.independent else explained)
-        * model_error(scored.name, alike, thresholds)
+        * further_error(scored.name, alike, thresholds)
         for scored in one.left
     }
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
@@ -139,7 +139,7 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
             alone = is_noise and not model.is_noise(projector, thresholds.chance_z)
             # What is predicted better beside a lag of none is so by the poles that were found with it.
             predicts = not rival.form.lag and improvement_z(before, rival.held_out) > thresholds.worse_z
-            if not (predicts or end[-1].determined(thresholds.determined_z, False, alone)):
+            if not (predicts or end[-1].determined(thresholds.chance_z, False, alone)):
                 continue
             # What it explains is lost where all is fitted together, or it explains less than its score promised.
             new = end[-1].laws[len(one.causes) :]
@@ -150,8 +150,8 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
                 continue
             if taken and is_worse(before, rival.held_out, thresholds.worse_z, thresholds.model_error):
                 end = in_best_forms(*end, search.probes)
-                held = end[1].held_out(end[-1].change_um)
-                if is_worse(before, held, thresholds.worse_z, thresholds.model_error):
+                # What had to be mended must predict better.
+                if not improvement_z(before, end[1].held_out(end[-1].change_um)) > thresholds.worse_z:
                     vetoed = True
                     continue
             same = indistinguishable(rival, fitted, max(drop, 0.0), is_noise, thresholds)

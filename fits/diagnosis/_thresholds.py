@@ -17,13 +17,14 @@ class Thresholds:
     apart_z
         Standard deviations up to which two are the same: effects of one class, estimates of one noise.
     model_error
-        Relative error of an effect's model: what a cause leaves may look like another effect of that size.
+        Relative error of a model: differences of that size say nothing.
+    further_error
+        Part of what causes explain, as a root mean square, that what they leave may look like another effect by: laws
+        of rigs are not those of the library.
     confused_error
         The same for effects that are known to be mistaken for each other.
-    determined_z
-        Standard deviations that a strength is away from zero.
     chance_z
-        Standard deviations by which a sum of squares exceeds its mean by chance.
+        Standard deviations up to which a sum of squares is above its mean, or a strength off zero, by chance.
     worse_z
         Standard deviations by which an extension may predict held-out data worse, and by which one that hardly stands
         out of the rest of the misfit, or is weak and small beside the noise, must predict them better; half as many
@@ -57,8 +58,8 @@ class Thresholds:
     tie: float = 10.0
     apart_z: float = 4.0
     model_error: float = 0.06
+    further_error: float = 0.15
     confused_error: float = 0.6
-    determined_z: float = 3.0
     chance_z: float = 3.0
     worse_z: float = 2.0
     worse_share: float = 0.005
