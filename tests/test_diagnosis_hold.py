@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
 
-from fits import Record, diagnose
+from fits import Record
 from fits.diagnosis import _plain_fit
 from fits.diagnosis._baseline import _hold_of, simulate
 from fits.diagnosis._plain_fit import PlainFit
@@ -228,53 +227,6 @@ def test_steps_are_taken_that_leave_less_beside_the_best_effect_or_predict_bette
 def replace_aside(fit):
     """The same with runs held out that go as those that were fitted."""
     return fitted_to(fit.holds, 5.0, 100.0, fit.holds, 10.0)
-
-
-def held(rng, command_V, interval_s):
-    """What a rig of plays with two modes makes of a command that is held, by SciPy, at the samples, in um.
-
-    A step begins at its sample; the first mode has 330 Hz, the second 790 Hz and 3 % of the static gain.
-    """
-    steps, lag_s = 8, 2e-4
-    fine_s = interval_s / steps
-    command = np.repeat(command_V, steps)
-    decay = np.exp(-fine_s / lag_s)
-    behind = lfilter([0.0, 1 - decay], [1.0, -decay], command - command[0]) + command[0]
-    moved = 0.6 * behind
-    for radius_V, weight in zip(rng.uniform(1, 25, 20), rng.exponential(0.02, 20), strict=True):
-        at, out = behind[0], np.empty(len(behind))
-        for k, value in enumerate(behind):
-            at = out[k] = min(max(at, value - radius_V), value + radius_V)
-        moved += weight * out
-    total = np.zeros(len(moved))
-    for share, mode_Hz, damping in ((0.97, 330.0, 0.015), (0.03, 790.0, 0.01)):
-        natural = 2 * np.pi * mode_Hz
-        plant = cont2discrete(([share * natural**2], [1, 2 * damping * natural, natural**2]), fine_s, "foh")
-        total += lfilter(plant[0].ravel(), plant[1], moved - moved[0])
-    return total[::steps] / 10
-
-
-@pytest.mark.study
-def test_a_held_command_does_not_hide_behind_a_second_mode(rng):
-    interval_s, n = 1e-4, 7000
-    time_s = np.arange(n) * interval_s
-    lines_Hz = np.geomspace(10, 1100, 60)
-    wide = sum(
-        np.sin(2 * np.pi * f * time_s + phase) for f, phase in zip(lines_Hz, rng.uniform(0, 6, 60), strict=True)
-    )
-    triangle = np.interp(time_s % 0.16, [0, 0.08, 0.16], [10.0, 70.0, 10.0])
-    stairs = np.repeat(rng.uniform(5, 85, 23), 320)[:n]
-    seed = rng.integers(2**32)
-    runs = []
-    for name, command in (("a.csv", triangle + 15 * wide / np.abs(wide).max()), ("b.csv", stairs)):
-        moved = held(np.random.default_rng(seed), command, interval_s)
-        noise = 1e-3 * np.ptp(moved) * rng.standard_normal(n)
-        runs.append(Record(time_s, command, moved + noise, source=name))
-    found = diagnose(runs)
-    # Behind lines, steps of one run were a second mode and a delay of half a sample.
-    assert [cause.name for cause in found.causes] == ["second_resonance"]
-    assert found.causes[0].parameters[1].value == pytest.approx(790, rel=0.01)
-    assert any("held between samples" in remark for remark in found.remarks)
 
 
 @pytest.mark.parametrize(("times", "taken"), [(0.0, "first"), (0.9, "zero"), (1.1, "zero"), (1.5, "first")])
