@@ -81,7 +81,7 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
     # Nor is what explains less than that in its place.
     held = np.random.default_rng(0).standard_normal(2400)
     scored = [
-        SimpleNamespace(name=name, form=FORMS[name], z=z, probe=None)
+        SimpleNamespace(name=name, form=FORMS[name], z=z, drop=z**2, probe=None)
         for name, z in (("backlash", 40.0), ("aging", 30.0))
     ]
     one = explanation(("creep",), 5000.0, cost=4000.0, left=scored, held=held)
@@ -97,6 +97,8 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
 
     monkeypatch.setattr(_select, "compare_rivals", compared)
     monkeypatch.setattr(_select, "leaders", lambda open_, _: open_[:1])
+    # In no other form of its effect does a cause explain more.
+    monkeypatch.setattr(_select, "in_best_forms", lambda *state: state[:3])
     monkeypatch.setattr(_select, "indistinguishable", lambda *_: ())
     monkeypatch.setattr(Explanation, "of", classmethod(lambda cls, causes, state, search: [c.name for c in causes]))
     monkeypatch.setattr(_select, "_that_every_rig_has", lambda found, _: found)
@@ -106,6 +108,7 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
         false_alarm=0.01,
         has_time=lambda: True,
         progress=print,
+        probes=(),
     )
     found = _select._grown(one, search, ())
     assert (found[0] if found else []) == followed
@@ -113,6 +116,18 @@ def test_a_further_cause_that_predicts_worse_is_not_followed(monkeypatch, grown,
     # The same two were reached in the other order.
     assert _select._grown(one, search, {frozenset(("backlash", "creep"))}) == []
     assert asked == ["backlash"]
+
+
+@pytest.mark.parametrize(("cost", "goes_on"), [(19_500.0, False), (10_000.0, True)])
+def test_no_more_is_asked_where_most_would_be_unexplained_with_as_many_more_causes(monkeypatch, cost, goes_on):
+    scored = [SimpleNamespace(name="backlash", form=FORMS["backlash"], z=40.0, drop=1600.0, probe=None)]
+    one, asked = explanation(("creep",), 5000.0, cost=cost, left=scored, held=np.zeros(3)), []
+    monkeypatch.setattr(_select, "compare_rivals", lambda *_: asked.append(True) or [])
+    monkeypatch.setattr(_select, "leaders", lambda open_, _: open_[:1])
+    settings = {"thresholds": THRESHOLDS, "false_alarm": 0.01, "has_time": lambda: True, "progress": print}
+    search = SimpleNamespace(plain=SimpleNamespace(cost=20_000.0), probes=(), **settings)
+    assert _select._grown(one, search, ()) == []
+    assert bool(asked) == goes_on
 
 
 @pytest.mark.parametrize(
