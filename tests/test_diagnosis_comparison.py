@@ -11,7 +11,7 @@ from data_synth._mechanics import Mechanics, Mode
 from fits import Record
 from fits.diagnosis import _comparison, _joint_fit, _select
 from fits.diagnosis._baseline import Baseline
-from fits.diagnosis._comparison import Rival, compare_rivals, further_error
+from fits.diagnosis._comparison import Rival, compare_rivals, model_error
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
@@ -246,7 +246,7 @@ def test_hum_raises_no_bar_for_what_the_command_makes(rng):
     found = select(case.bench, case.projector, probes, 0.01, rng, lambda _: None)
     print({name: one.z for name, one in plain.items()}, [(cause.name, cause.z) for cause in found.causes])
     assert [cause.name for cause in found.causes] == ["mains_hum", "transport_delay"]
-    assert found.causes[1].z < THRESHOLDS.further_error * found.causes[0].z
+    assert found.causes[1].z < THRESHOLDS.model_error * found.causes[0].z
 
 
 @pytest.mark.study
@@ -292,7 +292,7 @@ def test_a_density_is_smooth_again_beside_the_cause(rng, monkeypatch):
 
 def test_what_a_cause_is_mistaken_for_must_explain_more_beside_it():
     late = {"transport_delay"}
-    assert further_error("sensor_lowpass", late, THRESHOLDS) > further_error("backlash", late, THRESHOLDS)
+    assert model_error("sensor_lowpass", late, THRESHOLDS) > model_error("backlash", late, THRESHOLDS)
 
 
 @pytest.mark.parametrize(("z", "there"), [(8.0, True), (1.0, False)])

@@ -9,7 +9,7 @@ from test_diagnosis_decisions import misfit
 
 from fits import Record
 from fits.diagnosis import _misfit
-from fits.diagnosis._comparison import further_error
+from fits.diagnosis._comparison import model_error
 from fits.diagnosis._explanation import Cause, Selection
 from fits.diagnosis._occurrences import has_occurred
 from fits.diagnosis._thresholds import Thresholds
@@ -110,5 +110,5 @@ def test_a_loss_is_of_whole_samples_and_lies_inside_its_run(samples, after_s, oc
 
 def test_a_hysteresis_that_bends_to_anything_needs_the_evidence_of_what_it_is_mistaken_for():
     thresholds = Thresholds()
-    assert further_error("bouc_wen_hysteresis", ["creep"], thresholds) == thresholds.confused_error
-    assert further_error("backlash", ["creep"], thresholds) == thresholds.further_error
+    assert model_error("bouc_wen_hysteresis", ["creep"], thresholds) == thresholds.confused_error
+    assert model_error("backlash", ["creep"], thresholds) == thresholds.model_error

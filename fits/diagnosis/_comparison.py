@@ -259,16 +259,16 @@ def gain_ahead(left: Sequence[Scored], causes: Collection[str], explained: float
     """
     bar = max(explained, 0.0) ** 0.5
     further = [
-        one for one in left if one.name not in causes and one.z > bar * further_error(one.name, causes, thresholds)
+        one for one in left if one.name not in causes and one.z > bar * model_error(one.name, causes, thresholds)
     ]
     return max((one.drop for one in further), default=0.0)
 
 
-def further_error(name: str, causes: Collection[str], thresholds: Thresholds) -> float:
+def model_error(name: str, causes: Collection[str], thresholds: Thresholds) -> float:
     """Part of what some causes explain that an effect beside them must exceed, by what it is mistaken for."""
     if any(form.flexible for form in EFFECTS if form.name == name):
         return thresholds.confused_error
     own = {other for form in EFFECTS if form.name == name for other in form.confusions}
     if any(f.name in causes and (name in f.confusions or f.name in own) for f in EFFECTS):
         return thresholds.confused_error
-    return thresholds.further_error
+    return thresholds.model_error

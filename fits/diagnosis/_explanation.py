@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits.diagnosis._comparison import Rival, confusable_z, further_error, gain_ahead
+from fits.diagnosis._comparison import Rival, confusable_z, gain_ahead, model_error
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State
 from fits.diagnosis._projector import Projector
@@ -154,7 +154,7 @@ def _adds_little(one: Explanation, other: Explanation, plain: Refit, thresholds:
         return False
     further = set(one.names) - set(other.names)
     alike = {*other.names}.union(*(cause.behind for cause in other.causes))
-    off = max(further_error(name, alike, thresholds) for name in further)
+    off = max(model_error(name, alike, thresholds) for name in further)
     return other.model.cost - one.model.cost <= off**2 * other.modelled(plain)
 
 

@@ -9,9 +9,9 @@ from fits.diagnosis._comparison import (
     compare_rivals,
     confusable_z,
     criterion,
-    further_error,
     indistinguishable,
     leaders,
+    model_error,
 )
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Cause, Explanation, Search, Selection, best_of_ends, with_equals
@@ -100,7 +100,7 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
     explained = one.modelled(search.plain) ** 0.5
     bars = {
         scored.form: (whole**0.5 if scored.form.independent else explained)
-        * further_error(scored.name, alike, thresholds)
+        * model_error(scored.name, alike, thresholds)
         for scored in one.left
     }
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.

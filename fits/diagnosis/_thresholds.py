@@ -17,10 +17,7 @@ class Thresholds:
     apart_z
         Standard deviations up to which two are the same: effects of one class, estimates of one noise.
     model_error
-        Relative error of a model: differences of that size say nothing.
-    further_error
-        Part of what causes explain, as a root mean square, that what they leave may look like another effect by: laws
-        of rigs are not those of the library.
+        Relative error of an effect's model: what a cause leaves may look like another effect of that size.
     confused_error
         The same for effects that are known to be mistaken for each other.
     chance_z
@@ -58,7 +55,6 @@ class Thresholds:
     tie: float = 10.0
     apart_z: float = 4.0
     model_error: float = 0.06
-    further_error: float = 0.15
     confused_error: float = 0.6
     chance_z: float = 3.0
     worse_z: float = 2.0
