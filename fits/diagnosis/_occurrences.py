@@ -70,15 +70,16 @@ def add_occurrences(
 
     Several losses look like a drift, which has to be told from them. Of what jumps one is added for each other run:
     many jumps follow anything, and more are asked for beside other effects. `scored` are all of these: where another
-    explains more of the rest than one more occurrence, that is asked first.
+    explains more of the rest than one more jump, that is asked first.
     """
     first, form = len(found.laws) - 1, found.laws[-1].form
-    name, own = form.name, [one for one in scored if one.name == form.name]
+    own = [one for one in scored if one.name == form.name]
     if not form.counted:
         most = min(most, first + len(bench.prepared))
     while is_occurrence(found.laws[-1]) and len(found.laws) < most:
-        left = score(projector, [one.probe for one in scored], found.residual, found.basis()).each
-        if max(left, key=lambda one: one.z).name != name:
+        asked = [one.probe for one in (own if form.counted else scored)]
+        best = max(score(projector, asked, found.residual, found.basis()).each, key=lambda one: one.z)
+        if best.name != form.name:
             break
         more = _one_more(bench, projector, found, own)
         if not (more.determined(thresholds.chance_z) and has_occurred(bench, more)):
