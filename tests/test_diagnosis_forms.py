@@ -1,6 +1,7 @@
 """Of an effect that was found in one form, the form that explains more beside other causes."""
 
 import numpy as np
+import pytest
 from test_diagnosis_foreign import SLOW_V, plays
 
 from fits import Record
@@ -12,6 +13,7 @@ from fits.diagnosis._score import score
 INTERVAL_s = 0.02
 
 
+@pytest.mark.study
 def test_a_creep_taken_for_one_relaxation_goes_along_the_logarithm_of_time(rng):
     """As many relaxations as a logarithm has, each solved for by itself."""
     moved, late = plays(SLOW_V), np.zeros(len(SLOW_V))

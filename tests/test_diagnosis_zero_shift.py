@@ -30,7 +30,7 @@ def wander(rng, step_um):
     return np.interp(time_s, np.linspace(0, time_s[-1], 14), step_um * np.cumsum(rng.standard_normal(14)))
 
 
-@pytest.mark.parametrize("jumps", [True, False])
+@pytest.mark.parametrize("jumps", [True, pytest.param(False, marks=pytest.mark.study)])
 def test_a_jump_is_found_to_the_sample_and_a_wander_is_none(rng, jumps):
     time_s, instant_s = INTERVAL_s * np.arange(len(SLOW_V)), rng.uniform(10, 35)
     off = 0.05 * (time_s > instant_s) if jumps else wander(rng, 0.05)
