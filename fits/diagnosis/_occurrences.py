@@ -60,7 +60,9 @@ def is_abrupt(bench: Bench, projector: Projector, model: Refit, thresholds: Thre
         residual = projector.off(projector.residual - projector.join(change))
         return float(residual @ residual)
 
-    return left(True) > left(False) + thresholds.chance_z**2
+    # What is beyond noise may be anything, and differs by as much more.
+    at_once = left(False)
+    return left(True) > at_once + thresholds.chance_z**2 * max(at_once / projector.count, 1.0)
 
 
 def add_occurrences(
