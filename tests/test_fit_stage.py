@@ -262,8 +262,10 @@ def test_a_first_way_from_elsewhere_is_no_other_rig():
     runs = [Record(time_s, voltage_V, um, source=f"{k}.csv") for k, um in enumerate((first_um, settled_um))]
     refuse_slopes(runs)
     larger = Record(time_s, voltage_V, 1.2 * settled_um, source="larger.csv")
-    with pytest.raises(fits.DataError, match=r"larger.csv and 0.csv: .* times as far"):
-        refuse_slopes([runs[0], larger])
+    inverted = [Record(r.time_s, voltage_V, -r.displacement_um, source=r.source) for r in (runs[0], larger)]
+    for pair in ([runs[0], larger], inverted):
+        with pytest.raises(fits.DataError, match=r"larger.csv and 0.csv: .* times as far"):
+            refuse_slopes(pair)
 
 
 @pytest.mark.study

@@ -59,9 +59,9 @@ def _moved_um(record: Record) -> float:
 
 
 def _slope(record: Record) -> float:
-    """Displacement per voltage, least squares."""
+    """Displacement per voltage, least squares, in um/V; without its sign, which an inverted sensor has, too."""
     voltage_V, displacement_um = record.voltage_V, np.asarray(record.displacement_um)
-    return float(np.cov(voltage_V, displacement_um)[0, 1] / np.var(voltage_V, ddof=1))
+    return abs(float(np.cov(voltage_V, displacement_um)[0, 1] / np.var(voltage_V, ddof=1)))
 
 
 def speed_Hz(record: Record) -> float:
