@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,12 +19,11 @@ from microid.effects import AbstractEffect
 STEP = 1e-3
 # Standard deviations up to which a strength may be larger than it was found.
 _LARGEST_Z = 3.0
-# Rounds of a fit, the farthest that a coordinate moves in one, and the gain in chi-square below which it stops.
-_ROUNDS, _FARTHEST, _LEAST_GAIN = 12, 3.0, 0.1
+# Rounds of a fit, the farthest that a coordinate moves in one, the factor by which that is shortened where it was too
+# far, and the gain in chi-square below which a fit stops.
+_ROUNDS, _FARTHEST, _SHORTER, _LEAST_GAIN = 12, 3.0, 4.0, 0.1
 # Last rounds of which the best says what others may gain.
 _LAST = 3
-# Factor by which that is shortened where it was too far.
-_SHORTER = 4.0
 # Part of a derivative below which what the baseline leaves of it is rounding, and the variance of a coordinate that
 # the runs do not show.
 _ROUNDING_SHARE, _UNKNOWN_VARIANCE = 1e-4, 1e6
@@ -32,10 +31,8 @@ _ROUNDING_SHARE, _UNKNOWN_VARIANCE = 1e-4, 1e6
 _FARTHER, _ROOM_K = 2.0, 0.5
 # Part of the shortest record by which another instant is tried at first, and the gain in chi-square that pays.
 _FIRST_SHIFT, _PAYS = 0.05, 1.0
-# Displacements beyond this are those of a model that runs away.
-_AWAY_um = 1e9
-# Multiples of the linearised answer from which a fit may start.
-_MULTIPLES = (1.0, 3.0, 9.0)
+# Displacements beyond this are those of a model that runs away, and multiples of the linearised answer as starts.
+_AWAY_um, _MULTIPLES = 1e9, (1.0, 3.0, 9.0)
 
 
 @dataclass(frozen=True)
@@ -210,8 +207,8 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
 def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -> Refit:
     """Search for better instants of what happened at one, beyond a fit's steps, in laws from the `first` on.
 
-    The sum of squares over the instant is jagged where the stage rings: better ones are tried on both sides, nearer
-    and nearer.
+    The sum of squares over the instant is jagged where the stage rings, and a rise that is too long keeps to itself:
+    better ones are tried on both sides, nearer and nearer, and in the middle of a rise.
     """
     at = [k for k in range(first, len(model.laws)) if hasattr(model.laws[k].effect(model.x[k], 0), "after_s")]
     if not at:
@@ -221,7 +218,8 @@ def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -
     step_s = _FIRST_SHIFT * min(one.run.record.duration_s for one in bench.prepared)
     least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
     while step_s > least_s:
-        tried = [_moved(bench, projector, model, k, way, least_s) for k, way in product(at, (-step_s, step_s))]
+        ways = [(k, way) for k in at for way in (-step_s, *[0.0] * bool(model.laws[k].form.rise), step_s)]
+        tried = [_moved(bench, projector, model, k, way, least_s) for k, way in ways]
         best = min(tried, key=lambda one: one.cost)
         better = refit(bench, projector, best.laws, best.x, 2) if best.cost < model.cost else model
         # Where other coordinates still creep, any step would seem to pay.
@@ -248,9 +246,12 @@ def in_order(found: Refit, order: Sequence[int]) -> Refit:
 
 
 def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: float, least_s: float) -> Refit:
-    """Fit a law at another instant; all others stay, and follow along their tangent."""
-    here = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
-    later = [replace(one, after_s=jnp.maximum(one.after_s + way_s, least_s)) for one in here]  # type: ignore[attr-defined,call-arg]
+    """Fit a law at another instant, and at once from there; all others stay, and follow along their tangent."""
+    here: list[Any] = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
+    if rise := model.laws[k].form.rise:
+        at_once, half_s = {rise: jnp.asarray(least_s)}, [float(getattr(one, rise) - least_s) / 2 for one in here]
+        here = [replace(one, after_s=one.after_s + more, **at_once) for one, more in zip(here, half_s, strict=True)]
+    later = [replace(one, after_s=jnp.maximum(one.after_s + way_s, least_s)) for one in here]
     laws, x = model.with_law(k, Law(later, model.laws[k].remembers))
     order = [*(i for i in range(len(laws)) if i != k), k]
     owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
