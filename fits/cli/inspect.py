@@ -19,7 +19,8 @@ from fits.io._printable import printable
 def inspect(given: common.Given) -> None:
     """Say what a file of measurements holds, and which command reads it.
 
-    FILE is a CSV or another text, or of LabVIEW, TDMS, MATLAB, HDF5, NumPy or Parquet. Uses in brackets are guessed.
+    FILE is a CSV or another text, or of LabVIEW, TDMS, MATLAB, HDF5, NumPy, JSON or Parquet. Uses in brackets are
+    guessed.
     """
     found = late.inspect_table(given.file)
     rate = "of unknown rate" if found.rate_Hz is None else f"{found.rate_Hz:.6g} Hz"

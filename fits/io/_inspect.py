@@ -37,6 +37,8 @@ _MULTIPLES_OF_s = {"min": 60.0, "h": 3600.0}
 # Whole numbers of such a size, without a unit, are what a converter gives.
 _COUNTS = 10_000
 _READING = r".*(monitor|meas|readback).*"
+# A position that is asked for is a command.
+_ASKED = r"(target|goal|demand|setpoint|set_point|soll).*"
 
 
 @dataclass(frozen=True)
@@ -200,8 +202,9 @@ def _unknown_units(table: Table, found: dict[str, FloatArray], sources: dict[str
 
 
 def _score(name: str, column: str) -> int:
-    stem = "_".join(split_unit(name)[0].lower().split())
+    stem = "_".join(re.sub(r"\(\d+\)$", "", split_unit(name)[0]).lower().split())
     fits_names = {each for each, likely in _LIKELY.items() if re.fullmatch(likely, stem)}
+    fits_names = {"voltage_V"} if re.fullmatch(_ASKED, stem) else fits_names
     fit = 2 if column in fits_names else -3 if fits_names else 0
     return 4 * (known_unit(name) is not None) + fit - (re.fullmatch(_READING, stem) is not None)
 

@@ -10,10 +10,10 @@ import tempfile
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,6 +39,13 @@ _place: list[Path] = []
 _held: OrderedDict[Any, Future[Callable[..., Any]]] = OrderedDict()
 _MOST = 96
 _lock = threading.Lock()
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the array of such a number belongs in a result."""
+
+    number: int
 
 
 class _Unknown(Exception):
@@ -77,9 +84,12 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         leaves, form = jax.tree.flatten((args, kwargs))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        if any(isinstance(array, jax.core.Tracer) for array in arrays):
             return plain(*args, **kwargs)
-        kinds = tuple(_kind(leaf) if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
+        kinds = tuple(
+            (leaf.shape, leaf.dtype, leaf.weak_type) if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves
+        )
         asked = function, *_place, form, kinds
         with _lock:
             is_new = asked not in _held
@@ -93,7 +103,7 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
             except BaseException as error:
                 _held.pop(asked, None)
                 program.set_exception(error)
-        return program.result()(*args, **kwargs)
+        return program.result()(arrays)
 
     return call
 
@@ -128,14 +138,15 @@ def _compiled(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[
 
         program.__name__ = function.__name__
         compiled = jax.jit(program).lower(*leaves).compile()
-    form = jax.tree.structure(places)
+    # What it gives beside arrays is the same each time.
+    given, form = jax.tree.flatten(eqx.combine(jax.tree.map(_Place, places), rest))
 
-    def call(*args: Any, **kwargs: Any) -> Any:
-        values = compiled(*jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array)))
+    def call(leaves: Sequence[Any]) -> Any:
+        values = compiled(*leaves)
         if exported is not None:
             # Their values alone: they come bound to a device, for which others would be compiled once more.
             values = [jnp.asarray(np.asarray(value)) for value in values]
-        return eqx.combine(jax.tree.unflatten(form, values), rest)
+        return jax.tree.unflatten(form, [values[one.number] if isinstance(one, _Place) else one for one in given])
 
     return call
 

@@ -23,7 +23,8 @@ _PLAIN_SIGNS = {"µ": "u", "μ": "u", "°C": "degC"}  # both Unicode micro signs
 # What is a unit behind a blank or a slash, too, where much else may stand.
 _PLAIN = {*LENGTH, *VOLTAGE, *TIME, "min", "h", "%"}
 _LAST = re.compile(r"(?P<stem>.*\S)(?:\s+|\s*/\s*)(?P<unit>[^\s/]+)")
-BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\])]")
+# A number in round brackets counts channels.
+BRACKETS = re.compile(r"(?P<stem>.*?)\s*[\[(]\s*(?!\d+\s*\))(?P<unit>[^\[\]()]*?)\s*[\])]")
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def read_table(
 ) -> Record:
     """Read one run from a file of any format, or take it from a `DataFrame`, a `Dataset` or a mapping of arrays.
 
-    Formats are those of `fits/io/formats`: text, LabVIEW, MATLAB, HDF5, NumPy, Parquet and TDMS. Of a text the
+    Formats are those of `fits/io/formats`: text, LabVIEW, MATLAB, HDF5, NumPy, JSON, Parquet and TDMS. Of a text the
     separator (comma, semicolon, tab), a decimal comma, the encoding (UTF-8, UTF-16 with a byte-order mark, Latin-1)
     and gzip are recognised, and a line of units below the header, lines above it, and ISO 8601 time stamps; blank
     lines and those that begin with ``#`` or ``%`` are skipped. Headers such as ``voltage_mV`` are recognised by stem

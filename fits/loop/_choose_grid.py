@@ -138,7 +138,8 @@ def _stroke(run: Run) -> float:
     if _leads(voltage, displacement) > 0.5:
         raise DataError(
             f"{run.record.source}: the displacement runs ahead of the voltage round its loops, where a piezo stays "
-            "behind: the two columns are exchanged; correct the header, or name them the other way round"
+            "behind: the two columns are exchanged, or the second is the force that a motion meets, as of friction; "
+            "correct the header, or name them the other way round"
         )
     return float(np.ptp(displacement))
 
@@ -170,7 +171,8 @@ def _refuse_ringing(run: Run) -> None:
 def _leads(voltage_V: np.ndarray, displacement_um: np.ndarray) -> float:
     """Signed over absolute area of the loops: -1 where the displacement lags everywhere, 1 where it leads."""
     place = (voltage_V - voltage_V.mean()) / np.ptp(voltage_V)
-    beside = displacement_um - np.polyval(np.polyfit(place, displacement_um, 3), place)
+    cubic = np.vander(place, 4)
+    beside = displacement_um - cubic @ np.linalg.lstsq(cubic, displacement_um)[0]
     parts = (beside[1:] + beside[:-1]) * np.diff(place)
     return float(parts.sum() / (np.abs(parts).sum() + 1e-300))
 

@@ -199,7 +199,8 @@ def _header(lines: list[_Line], declared: str) -> tuple[int, str, int, int | Non
             # Words beside the first rows of numbers, as in captures of Tektronix: there is no header.
             return min(above), separator, min(above), None
         units = [k for k, cells in above.items() if _are_units(cells)]
-        words = [k for k in above if k not in units]
+        # A row of which some cells are empty is a row.
+        words = [k for k, cells in above.items() if k not in units and not all(map(_is_number, cells))]
         named = [k for k, cells in above.items() if any(map(recognise, cells))]
         over = [k for k in words if units and k < units[-1]]
         k = next(iter(named), (over or words or [*above])[-1])
