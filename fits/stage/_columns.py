@@ -85,13 +85,13 @@ def _propagated(
 
 @kept
 def _before_and_after(
-    coordinates: Coordinates[Stage], place: int, z: Float[Array, " p"], samples: Samples
+    coordinates: Coordinates[Stage], place: int, z: Float[Array, " p"], samples: Samples, each: int
 ) -> tuple[Signal, LinearSystem | None]:
-    """What the hysteresis sees, at the samples, and the linear system that follows it."""
+    """What the hysteresis sees, at each so many of the refined times, and the linear system that follows it."""
     stage = coordinates(z)
     seen = ahead(stage, place, samples)
-    at_samples = seen.with_values(seen.values[:: samples.stride], seen.before)
-    return at_samples, joined(stage.parts[place + 1 :])
+    some = seen.with_values(seen.values[::each], seen.before)
+    return some, joined(stage.parts[place + 1 :])
 
 
 @kept
@@ -102,27 +102,40 @@ def _design(
 
 
 def _passed(
-    chain: Chain, z: Float[Array, " p"], run: Run, respond: Callable[[np.ndarray], Iterator[np.ndarray]]
+    chain: Chain,
+    z: Float[Array, " p"],
+    run: Run,
+    respond: Callable[[np.ndarray], Iterator[np.ndarray]],
+    steps: int = 1,
 ) -> Iterator[np.ndarray]:
-    """What follows the hysteresis makes of responses to the voltage that it sees, piece by piece."""
+    """What follows the hysteresis makes of responses to the voltage that it sees, piece by piece.
+
+    They are those in so many steps from sample to sample.
+    """
     assert chain.place is not None
-    seen, system = _before_and_after(chain.coordinates, chain.place, z, run.samples)
-    responses = respond(np.asarray(seen.values)[: len(run.record)])
+    seen, system = _before_and_after(chain.coordinates, chain.place, z, run.samples, run.stride // steps)
+    responses = respond(np.asarray(seen.values)[: (len(run.record) - 1) * steps + 1])
     if system is None:
         return responses
     rate, rest, read = map(np.asarray, (system.rate_per_s, system.rest, system.read))
     behind = Linear(rate, rest, read, float(system.gain), 0.0)
     hold, settling_s = lines_of(seen)
     settles = None if settling_s is None else float(settling_s)
-    return behind.follow(intervals(run.record.time_s), responses, hold, settles)
+    each_s = intervals(run.record.time_s) / steps
+    return behind.follow(each_s if len(each_s) == 1 else np.repeat(each_s, steps), responses, hold, settles)
 
 
-def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterator[tuple[int, np.ndarray]]:
+def pieces(
+    chain: Chain, z: Float[Array, " p"], run: Run, free: bool, refined: bool = False
+) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the rows of the columns, piece by piece, with the sample that each piece begins at.
 
-    They are not refined: good enough as directions to move in, while only the residual decides where the fit ends.
+    Unless they are `refined`, they are not followed between samples: good enough as directions to move in, while only
+    the residual decides where the fit ends.
     """
     grid, n = chain.grid, len(run.record)
+    run = run.coarser if refined else run
+    steps = run.stride if refined else 1
     if grid is None or chain.place is None or not free:
         yield from ((first, np.zeros((min(PIECE, n - first), 0))) for first in range(0, n, PIECE))
         return
@@ -130,14 +143,15 @@ def pieces(chain: Chain, z: Float[Array, " p"], run: Run, free: bool) -> Iterato
 
     def respond(voltage_V: np.ndarray) -> Iterator[np.ndarray]:
         memory = run.samples.start.memory
-        for first in range(0, n, PIECE):
+        for first in range(0, len(voltage_V), PIECE):
             some = voltage_V[first : first + PIECE]
             padded = jnp.asarray(np.pad(some, (0, PIECE - len(some)), mode="edge"))
             rows, memory = _design(grid, table, padded, memory)
             yield np.asarray(rows)[: len(some)]
 
-    for k, rows in enumerate(_passed(chain, z, run, respond)):
-        yield k * PIECE, rows
+    for k, rows in enumerate(_passed(chain, z, run, respond, steps)):
+        first = -(-k * PIECE // steps)
+        yield first, rows[first * steps - k * PIECE :: steps]
 
 
 def combined(chain: Chain, z: Float[Array, " p"], run: Run, columns_um: np.ndarray) -> Iterator[np.ndarray]:

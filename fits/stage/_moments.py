@@ -41,9 +41,17 @@ class RunSums:
 
 
 def run_sums(
-    chain: Chain, z: Float[Array, " p"], columns_um: Float[Array, " D"], run: Run, free: bool = True
+    chain: Chain,
+    z: Float[Array, " p"],
+    columns_um: Float[Array, " D"],
+    run: Run,
+    free: bool = True,
+    refined: bool = False,
 ) -> RunSums:
-    """Pass one run through the regression on coordinates and, if they are `free`, columns, linearised there."""
+    """Pass one run through the regression on coordinates and, if they are `free`, columns, linearised there.
+
+    Columns may be `refined`, followed between samples as well.
+    """
     samples, size = run.samples, chain.size if free else 0
     out, slope, nuisance = linearise(chain, z, columns_um, run.coarser)
     if run.coarser is not run:
@@ -54,7 +62,7 @@ def run_sums(
     known = size + slope.shape[1]
     rows = np.empty((min(len(weight), PIECE), known + nuisance.shape[1]))
     sums = Moments.empty(rows.shape[1])
-    for first, columns in pieces(chain, z, run, free):
+    for first, columns in pieces(chain, z, run, free, refined):
         piece = slice(first, first + columns.shape[0])
         used = rows[: columns.shape[0]]
         used[:, :size], used[:, size:known], used[:, known:] = columns, slope[piece], nuisance[piece]

@@ -181,7 +181,7 @@ def solve_chain(
     rounds: list[tuple[tuple[float, ...], Hyper | None]] = []
     known: Hyper | None = None
     for number in range(_ROUGH if rough else _ROUNDS):
-        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
+        runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted, rough)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
         if not np.all(np.isfinite(weighing.noise_um)):
             raise FitError(FitStatus.NONFINITE)
@@ -248,7 +248,7 @@ def solve_chain(
             settled = Solved(problem, z, columns_um, hyper, runs, sums, weighing)
             continue
         if distance < _STATIONARY:
-            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted)
+            runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted, rough)
             return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
     if rough or accept_best:
         return Solved(problem, z, columns_um, hyper, runs, sums, weighing)
@@ -277,15 +277,17 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: list[Run], loss: str, counted: Sequence[float]
+    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: list[Run], *settings: Any
 ) -> tuple[list[Run], list[RunSums], Weighing]:
+    loss, counted, rough = settings
     chain, free = problem.chain, problem.hyper is not None
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
         # Outliers count linearly (Huber).
         runs = [replace(run, weight=huber_weight(one, run.fitted)) for run, one in zip(runs, left, strict=True)]
     place = chain, jnp.asarray(z), jnp.asarray(columns_um)
-    sums = map_in_threads(lambda run: run_sums(*place, run, free), runs)
+    # Columns that are not followed between samples promise what they do not hold where a stage rings.
+    sums = map_in_threads(lambda run: run_sums(*place, run, free, not rough), runs)
     weighing = Weighing.of(runs, [one.residual_um for one in sums], *counted)
     return runs, sums, replace(weighing, least_noise_share=problem.least_noise_share)
 
@@ -315,7 +317,9 @@ def _step(
     size = 0 if hyper is None else chain.size
     reduced, step, follow = split_moments(total, size, damping)
     if hyper is not None and chain.grid is not None:
-        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, hyper, known=known)
+        # The smoothness of the round before may be that of what was not fitted then.
+        fresh = replace(Hyper.start(), log_variance=hyper.log_variance)
+        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, fresh, known=known)
         columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
         step = step - follow @ columns
         variance = float(np.exp(hyper.log_variance)) * stroke_um**2
