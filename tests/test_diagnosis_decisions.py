@@ -184,10 +184,11 @@ class Answer:
 @pytest.fixture
 def asked(monkeypatch):
     """How records were read, in order; the answers are made by hand."""
-    log = SimpleNamespace(readings=[], answers=[])
+    log = SimpleNamespace(readings=[], answers=[], places=[], onward=[])
 
-    def prepare(reading, progress, has_time):
+    def prepare(reading, progress, has_time, onward):
         log.readings.append(reading)
+        log.onward.append(onward)
         baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("said",))
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
         return Prepared(reading, baseline, projector=None, **parts)
@@ -201,14 +202,16 @@ def asked(monkeypatch):
         return Answer("effect_found" if causes else "no_effect", causes, gain, answer, ready.baseline.remarks)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
-    monkeypatch.setattr(_diagnose, "select", lambda *_: None)
+    found = SimpleNamespace(plain_instead=lambda _: log.places.pop(0) if log.places else None)
+    monkeypatch.setattr(_diagnose, "select", lambda *_: found)
     monkeypatch.setattr(_diagnose, "conclude", conclude)
     record = Record(np.arange(5.0), np.arange(5.0), np.zeros(5))
 
-    def ask(*answers, **options):
-        log.answers, log.readings = list(answers), []
+    def ask(*answers, places=(), **options):
+        log.answers, log.readings, log.places, log.onward = list(answers), [], list(places), []
         found = fits.diagnose([record], **options)
         assert len(log.readings) == len(answers)
+        assert log.onward == [None, *places, *[None] * len(answers)][: len(answers)]
         return found, found.of, log.readings
 
     return ask
@@ -220,6 +223,12 @@ def test_a_plain_answer_is_taken(asked):
     assert kept is answer
     assert (reading.fraction, reading.initial) == (0.2, "unknown")
     assert found.remarks == ("said",)
+
+
+def test_a_plain_stage_that_was_found_beside_an_effect_of_none_is_gone_on_from(asked):
+    _, kept, (first, again) = asked({}, {"z": (9.0,)}, places=["there"])
+    assert kept == {"z": (9.0,)}
+    assert first is again
 
 
 @pytest.mark.parametrize("z", [20.0, 5.0])

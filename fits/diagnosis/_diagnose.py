@@ -11,7 +11,8 @@ import numpy as np
 from fits.diagnosis._baseline import with_paths
 from fits.diagnosis._conclude import conclude
 from fits.diagnosis._experiment import Request
-from fits.diagnosis._prepare import Reading, prepare_diagnosis
+from fits.diagnosis._explanation import Selection
+from fits.diagnosis._prepare import Prepared, Reading, prepare_diagnosis
 from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._result import Diagnosis, Step
 from fits.diagnosis._select import select
@@ -21,6 +22,7 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import refuse_repeats
 from fits.io._threads import one_thread
+from fits.stage._solve import Problem
 from microid.effects import card_of
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
@@ -140,13 +142,19 @@ def diagnose(
 
     has_time = before(_ASKED)
 
-    def answer(reading: Reading, *remarks: str) -> Diagnosis:
-        ready = prepare_diagnosis(reading, progress, before(_PREPARED))
-        remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
-        ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
+    def selected(reading: Reading, onward: Problem | None = None) -> tuple[Prepared, Selection]:
+        ready = prepare_diagnosis(reading, progress, before(_PREPARED), onward)
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
-        found = select(*stage, false_alarm, rng, progress, thresholds, has_time)
+        return ready, select(*stage, false_alarm, rng, progress, thresholds, has_time)
+
+    def answer(reading: Reading, *remarks: str) -> Diagnosis:
+        ready, found = selected(reading)
+        if (better := found.plain_instead(thresholds)) is not None and has_time():
+            progress("fitting the plain stage again, from where it has gone beside an effect that explains little")
+            ready, found = selected(reading, better)
+        remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
+        ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
         request = Request(duration_s, limits, margin, has_time) if has_time() else None
         return conclude(ready, found, [*records, *aside], false_alarm, progress, request, before(_REFINED))
 

@@ -9,9 +9,10 @@ from fits.diagnosis._comparison import Rival, confusable_z, gain_ahead, model_er
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit
+from fits.diagnosis._refit import Refit, nothing
 from fits.diagnosis._score import Family, Probe, Scored, score
 from fits.diagnosis._thresholds import Thresholds
+from fits.stage._solve import Problem
 from fits.stats._compare import is_worse
 from microid.effects import card_of
 
@@ -58,6 +59,16 @@ class Selection:
     first: Projector
     explained: float = 0.0
     finest: bool = False
+
+    def plain_instead(self, thresholds: Thresholds) -> Problem | None:
+        """Where the plain stage is, if it has gone there beside effects that explain little at that place."""
+        baseline = self.projector.regression.baseline
+        if not self.causes or baseline.problem is None:
+            return None
+        there = nothing(self.bench, self.projector).cost
+        if there - self.model.cost > thresholds.minor_share * (self.plain.cost - self.model.cost):
+            return None
+        return replace(baseline.problem, z=baseline.z, columns_um=baseline.columns_um)
 
 
 @dataclass(frozen=True)

@@ -98,11 +98,15 @@ class Prepared:
 
 
 def prepare_diagnosis(
-    reading: Reading, progress: Callable[[str], None], has_time: Callable[[], bool] = lambda: True
+    reading: Reading,
+    progress: Callable[[str], None],
+    has_time: Callable[[], bool] = lambda: True,
+    onward: Problem | None = None,
 ) -> Prepared:
     """Fit the plain stage, learn the noise, and simulate every probe of every effect.
 
-    The stage is fitted again, its command in another way between samples, only where it still `has_time`.
+    The stage is fitted again, its command in another way between samples, only where it still `has_time`. The first
+    fit goes `onward` from one that was made.
     """
     records, initial, fraction = reading.records, reading.initial, reading.fraction
     said: tuple[str, ...] = ()
@@ -135,7 +139,7 @@ def prepare_diagnosis(
 
     progress(Step.BASELINE)
     holds = tuple(map(_hold_of_plateaus, records))
-    here = fitted(holds)
+    here = fitted(holds, onward)
     drop_programs(records)
     progress(Step.PROBES)
     words = ""

@@ -103,6 +103,13 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
         * model_error(scored.name, alike, thresholds)
         for scored in one.left
     }
+    beyond = model.cost - projector.count + projector.freedom
+    for scored in one.left if taken else ():
+        # What leaves nothing but noise of nearly all that is left explains more than an error of a model looks like.
+        is_all = scored.drop > (1 - thresholds.minor_share) * beyond
+        quiet = beyond - scored.drop < thresholds.chance_z * (2 * projector.count) ** 0.5
+        if is_all and quiet and model_error(scored.name, alike, thresholds) == thresholds.model_error:
+            bars[scored.form] = min(bars[scored.form], thresholds.strong_z)
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
     sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
     room = len(one.names) < thresholds.most_causes and len(one.causes) < _MOST_LAWS
