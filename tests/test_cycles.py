@@ -1,12 +1,15 @@
 """What repeats itself with the position, found and taken off before noise is read off the rest."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from fits.diagnosis import _plain_fit
 from fits.diagnosis._noise import _without_cycles
 from fits.diagnosis._thresholds import THRESHOLDS
-from fits.stats._cycles import cycles
+from fits.stats._cycles import Cycles, cycles
 from fits.stats._noise import rough_noise_um
 
 
@@ -51,3 +54,13 @@ def test_evidence_of_a_period_is_in_units_of_what_is_left(rng):
     found = cycles([noise + 20 * wave], [position_um])
     assert found.z > THRESHOLDS.cycles
     assert found.drop == pytest.approx(200 * len(position_um), rel=0.1)
+
+
+@pytest.mark.parametrize(("step_um", "asked"), [(0.0, True), (0.1, True), (0.0348, False), (0.0349, False)])
+def test_what_repeats_itself_with_the_step_of_the_readings_is_their_rounding(monkeypatch, step_um, asked):
+    monkeypatch.setattr(_plain_fit, "repeats_in", lambda *_: Cycles(0.0348, 900.0, 1e4))
+    monkeypatch.setattr(_plain_fit, "scales_of", lambda bench, noise_um, period_um: period_um)
+    faults = SimpleNamespace(quantum_um=step_um, noise=[SimpleNamespace(total_um=0.01)])
+    parts = {"projector": None, "left": None, "bench": SimpleNamespace(plain=None)}
+    here = SimpleNamespace(faults=faults, thresholds=THRESHOLDS, **parts)
+    assert _plain_fit.PlainFit.scales.func(here) == (0.0348 if asked else None)

@@ -60,7 +60,10 @@ class PlainFit:
     @cached_property
     def scales(self) -> Scales:
         repeated = repeats_in(self.projector, self.left, self.bench.plain)
-        period_um = repeated.period_um if repeated.z > self.thresholds.cycles else None
+        # What repeats itself with the step of the readings is their rounding.
+        step_um = self.faults.quantum_um
+        rounding = step_um > 0 and abs(repeated.period_um / step_um - 1) < self.thresholds.model_error
+        period_um = repeated.period_um if repeated.z > self.thresholds.cycles and not rounding else None
         return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise), period_um)
 
     @cached_property
