@@ -90,7 +90,7 @@ def test_a_lag_that_does_not_show_is_followed_as_far_as_it_may_be(rng):
     found = np.array([float(effect.expansion_um_per_K) for effect in effects])
     np.testing.assert_allclose(found[near], np.array(sizes)[near], rtol=0.02, atol=1e-4)
     # What is reported reaches as far.
-    expansion = _parameters(law, x, covariance, along)[0]
+    expansion = _parameters(law, x, covariance, along, STEP_S)[0]
     above = np.max((np.array(sizes)[near] - expansion.value) / away[near])
     assert expansion.upper >= expansion.value + 1.9 * above
 
@@ -100,7 +100,7 @@ def test_what_shows_well_is_not_followed(rng):
     case = drifting(rng, 2.0, 5.0)
     covariance, along, _, law, x = followed(case)
     assert along == []
-    value, sd = (getattr(_parameters(law, x, covariance, along)[1], name) for name in ("value", "sd"))
+    value, sd = (getattr(_parameters(law, x, covariance, along, STEP_S)[1], name) for name in ("value", "sd"))
     assert value == pytest.approx(5.0, abs=5 * sd)
 
 
