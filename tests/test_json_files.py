@@ -48,7 +48,7 @@ def test_null_is_a_missing_number_and_other_content_is_refused(tmp_path, rng):
     assert len(fits.read_csv(path, missing="drop").time_s) == len(time_s) - 1
     for text, words in {
         '{"a": "b"}': "expected a JSON file with arrays of numbers, found none",
-        '{"a": [1, 2], "b"': "line 1",
+        '{"a": [1, 2], "b"': "expected a table in JSON, found a broken or cut one (",
         "[[1, 2], [3]]": "expected a JSON file with arrays of numbers, found none",
         "": "it is empty",
         "\xff": "run.json",

@@ -16,7 +16,7 @@ _WHAT = "a JSON file"
 def open_json(path: str, data: bytes) -> Table:
     """Read all arrays of numbers of one length; null is a missing number. Columns of a matrix alone are numbered."""
     refuse_large(path, len(data), MOST_JSON_BYTES)
-    content = parse_json(data.decode("utf-8-sig"), path, _WHAT)
+    content = parse_json(data.decode("utf-8-sig"), path, "a table")
     if isinstance(content, dict) and str(content.get("schema")).startswith("microid."):
         what = "expected a header and rows of numbers, found JSON; name a table (microid info shows a model file)"
         raise data_error(path, what, "line 1")
