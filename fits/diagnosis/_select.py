@@ -104,11 +104,11 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
         for scored in one.left
     }
     beyond = model.cost - projector.count + projector.freedom
-    for scored in one.left if taken else ():
+    chance = thresholds.chance_z * (2 * projector.count) ** 0.5
+    for scored in one.left if taken and beyond > chance else ():
         # What leaves nothing but noise of nearly all that is left explains more than an error of a model looks like.
-        is_all = scored.drop > (1 - thresholds.minor_share) * beyond
-        quiet = beyond - scored.drop < thresholds.chance_z * (2 * projector.count) ** 0.5
-        if is_all and quiet and model_error(scored.name, alike, thresholds) == thresholds.model_error:
+        is_all = scored.drop > max((1 - thresholds.minor_share) * beyond, beyond - chance)
+        if is_all and model_error(scored.name, alike, thresholds) == thresholds.model_error:
             bars[scored.form] = min(bars[scored.form], thresholds.strong_z)
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
     sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
