@@ -131,6 +131,26 @@ def test_no_more_is_asked_where_most_would_be_unexplained_with_as_many_more_caus
 
 
 @pytest.mark.parametrize(
+    ("cause", "left", "asked_for"),
+    [
+        ("bouc_wen_hysteresis", 1650.0, True),
+        ("bouc_wen_hysteresis", 4000.0, False),  # more is left than that explains
+        ("bouc_wen_hysteresis", 100.0, False),  # chance leaves as much
+        ("creep", 1650.0, False),  # a drift is what an error of creep looks like
+    ],
+)
+def test_what_leaves_nothing_but_noise_is_asked_for_below_the_errors_of_models(monkeypatch, cause, left, asked_for):
+    scored = [SimpleNamespace(name="thermal_drift", form=FORMS["thermal_drift"], z=40.0, drop=1600.0, probe=None)]
+    one, asked = explanation((cause,), 5000.0, cost=990.0 + left, left=scored, held=np.zeros(3)), []
+    monkeypatch.setattr(_select, "compare_rivals", lambda *_: asked.append(True) or [])
+    monkeypatch.setattr(_select, "leaders", lambda open_, _: open_[:1])
+    monkeypatch.setattr(Explanation, "modelled", lambda *_: 1e6)
+    settings = {"thresholds": THRESHOLDS, "false_alarm": 0.01, "has_time": lambda: True, "progress": print}
+    assert _select._grown(one, SimpleNamespace(plain=SimpleNamespace(cost=1e6), probes=(), **settings), ()) == []
+    assert bool(asked) == asked_for
+
+
+@pytest.mark.parametrize(
     ("made_um", "left_um", "explained", "verdict"),
     [
         ((0.007,), 0.04, False, "unexplained"),
