@@ -277,9 +277,14 @@ def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
 
 
 def _gather(
-    problem: Problem, z: np.ndarray, columns_um: np.ndarray, runs: list[Run], *settings: Any
+    problem: Problem,
+    z: np.ndarray,
+    columns_um: np.ndarray,
+    runs: list[Run],
+    loss: str,
+    counted: Sequence[float],
+    rough: bool,
 ) -> tuple[list[Run], list[RunSums], Weighing]:
-    loss, counted, rough = settings
     chain, free = problem.chain, problem.hyper is not None
     if loss != "squares":
         left = _residuals(chain, z, columns_um, runs)
