@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fits import Record
-from fits.diagnosis import _plain_fit
 from fits.diagnosis._baseline import _hold_of, simulate
 from fits.diagnosis._plain_fit import PlainFit
 from fits.diagnosis._prepare import _hold_of_plateaus
@@ -145,9 +144,12 @@ class Other:
     """A fit with the command in another way."""
 
     holds: tuple[str, ...]
+    left: np.ndarray
     left_beside_best: float
-    regression: None = None
-    faults: SimpleNamespace | None = None
+    lag: float = np.inf
+
+    def left_beside_lag(self):
+        return self.lag
 
     def largest_z(self):
         return 30.0
@@ -159,21 +161,46 @@ class Other:
 @pytest.mark.parametrize(
     ("curves", "best_z", "kept"), [(22.31, 60.0, True), (22.31, 30.0, False), (22.6, 30.0, True), (10.0, 60.0, False)]
 )
-def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(monkeypatch, curves, best_z, kept):
+def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(curves, best_z, kept):
     # In noise variances; as much as 22.5 is left beside lines. The best effect there may explain less than curves.
     lines, there = np.full(10_000, 22.5**0.5), np.full(10_000, curves**0.5)
-    projector = SimpleNamespace(off=lambda joined: joined, residual=there)
-    monkeypatch.setattr(_plain_fit, "Projector", lambda *_: SimpleNamespace(bounded=lambda: projector))
     nothing = {"left_beside_lag": lambda: np.inf, "left_beside_delay": lambda: np.inf}
-    faults = SimpleNamespace(noise=None)
-    fit = SimpleNamespace(left=lines, faults=faults, largest_z=lambda: best_z, left_beside_best=1e5, **nothing)
-    other = Other(holds=("smooth",), left_beside_best=1e5)
-    assert PlainFit.outdoes(fit, other) == kept
+    fit = SimpleNamespace(left=lines, largest_z=lambda: best_z, left_beside_best=1e5, **nothing)
+    assert PlainFit.outdoes(fit, Other(("smooth",), there, 1e5)) == kept
     # An effect beside one of them leaves half of what is left beside any and the other, or not.
     for less, more, far in ((11_000.0, 20_000.0, True), (16_000.0, 20_000.0, False), (9_000.0, 10_400.0, False)):
-        for here, there in ((less, more), (more, less)):
-            fit.left_beside_best, other = here, Other(holds=("smooth",), left_beside_best=there)
-            assert PlainFit.outdoes(fit, other) == (here < there if far else kept)
+        for here, beyond in ((less, more), (more, less)):
+            fit.left_beside_best = here
+            assert PlainFit.outdoes(fit, Other(("smooth",), there, beyond)) == (here < beyond if far else kept)
+
+
+@pytest.mark.parametrize(
+    ("lag", "best", "steps", "steps_lag", "steps_best", "lines"),
+    [
+        # A lag beside lines leaves noise alone, and nothing does so beside steps, lag or not.
+        (9_900.0, 30_000.0, 2.6, 10_900.0, 18_000.0, True),
+        # It leaves as much beside either, or little less: steps need no parameter.
+        (9_900.0, 30_000.0, 2.6, 9_900.0, 18_000.0, False),
+        (19_300.0, 30_000.0, 2.6, 20_000.0, 20_000.0, False),
+        # Another effect leaves noise alone beside lines, or beside steps.
+        (15_000.0, 9_900.0, 2.6, 14_000.0, 14_000.0, True),
+        (15_000.0, 30_000.0, 2.6, 14_000.0, 9_900.0, False),
+        # Steps leave noise without any.
+        (9_000.0, 30_000.0, 1.0, 10_000.0, 10_000.0, False),
+    ],
+)
+def test_lines_are_kept_where_a_lag_or_an_effect_leaves_less_than_any_beside_steps(
+    lag, best, steps, steps_lag, steps_best, lines
+):
+    left = np.full(10_000, 3.7**0.5), np.full(10_000, steps**0.5)
+    fit = SimpleNamespace(
+        left=left[0],
+        left_beside_lag=lambda: lag,
+        left_beside_best=best,
+        largest_z=lambda: 80.0,
+        thresholds=THRESHOLDS,
+    )
+    assert PlainFit.outdoes(fit, Other(("zero",), left[1], steps_best, steps_lag)) == lines
 
 
 def fitted_to(holds, left, best_z, aside=(), missed_um2=1.0, late=0.0):

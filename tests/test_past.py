@@ -17,7 +17,8 @@ from fits.loop._run import known_samples, pasts_to_estimate, prepare_run
 from fits.stage._run import nuisance_columns
 from fits.stats._noise import stretches
 
-LEVELS = 120
+# Columns of either function that are splines; those of its kinks follow.
+LEVELS, SPLINES = 120, 7
 
 
 def relays(voltage, state, weight, on_V, off_V):
@@ -51,6 +52,9 @@ WAYS = {
     "up first": lambda n: np.interp(np.linspace(0, 4, n), [0, 1, 2, 3, 4], [0.3, 0.9, 0.1, 0.9, 0.3]),
     "down first": lambda n: np.interp(np.linspace(0, 4, n), [0, 1, 2, 3, 4], [0.6, 0.2, 0.8, 0.4, 0.8]),
     "ever farther": lambda n: grown(n, 0.5),
+    "a little, and then farther": lambda n: np.interp(
+        np.linspace(0, 4, n), [0, 1, 2, 3, 4], [0.5, 0.65, 0.1, 0.9, 0.3]
+    ),
 }
 
 
@@ -75,6 +79,28 @@ def test_relays_not_yet_swept_add_what_the_columns_span(rng, way):
     assert np.std(difference) > 0.01
     # What is left is the relays' own coarseness, and what a sum of two functions misses.
     assert np.std(left) < 0.05 * np.std(difference)
+
+
+def test_a_function_of_how_far_a_run_went_has_a_kink_where_it_went_the_other_way(rng):
+    """Plays at rest; a first swing smaller than the next left 25 nm of 11 um, which looked like a zero shift."""
+    start, first = 0.5, rng.uniform(0.6, 0.75)
+    voltage = np.interp(np.linspace(0, 4, 4000), range(5), [start, first, 0.1, 0.9, 0.3])
+    radius = rng.gamma(2.0, 0.08, 2000)
+    difference = np.empty(len(voltage))
+    rested, swept = np.full(len(radius), start), np.full(len(radius), start - radius)
+    for k, value in enumerate(voltage):
+        rested, swept = (np.clip(one, value - radius, value + radius) for one in (rested, swept))
+        difference[k] = np.mean(rested - swept)
+    columns = np.asarray(past_columns(jnp.asarray(voltage)))
+    splines = np.concatenate([half[:, :SPLINES] for half in np.split(columns, 2, axis=1)], axis=1)
+
+    def left(basis):
+        basis = np.concatenate([basis, np.ones((len(voltage), 1))], axis=1)
+        return np.std(difference - basis @ np.linalg.lstsq(basis, difference, rcond=None)[0])
+
+    print(np.std(difference), left(splines), left(columns))
+    assert left(columns) < 0.01 * np.std(difference)
+    assert left(columns) < 0.3 * left(splines)
 
 
 def play(voltage, radius, at):
@@ -139,7 +165,9 @@ def test_columns_are_the_b_splines_of_scipy(rng):
     ):
         left = (reached[-1] - reached) / (reached[-1] - reached[0])
         knots = np.r_[np.zeros(4), 0.2, 0.4, 0.6, 0.8, np.ones(4)]
-        np.testing.assert_allclose(columns, BSpline.design_matrix(left, knots, 3).toarray()[:, 1:], atol=1e-13)
+        np.testing.assert_allclose(
+            columns[:, :SPLINES], BSpline.design_matrix(left, knots, 3).toarray()[:, 1:], atol=1e-13
+        )
 
 
 def test_a_past_is_estimated_where_a_loop_is_left_beside_it():

@@ -32,7 +32,7 @@ _HOLDS: Holds = "first", "smooth", "zero"
 _NOISE = 0.05
 # So many effects are fitted beside a way of the command, which one explains that leaves half of what others do.
 _TRIED, _HALF = 4, 0.5
-# A lag beside lines that is no more than steps leaves less of what is beyond noise by no more than this part.
+# Lines with a lag that is no more than steps leave less of what is beyond noise by no more than this part.
 _PLAIN = 0.1
 
 
@@ -284,29 +284,30 @@ class PlainFit:
         return min(model.cost, alternate(self.bench, self.projector, model)[-1].cost)
 
     def outdoes(self, other: "PlainFit") -> bool:
-        """Whether a lag of the reading leaves less here than another fit does with the best effect beside it.
+        """Whether less is left here than by another fit, each with what explains most beside it.
 
-        Curves need no effect, or leave less by far beside one, or lines are kept. Steps are much like lines behind a
-        delay: that is not asked then. First it is asked whether an effect leaves far less beside one of them than any
-        does beside the other.
+        Steps need no parameter, and are much like lines behind a delay, so that lines must leave less by more than a
+        little, and a lag may stand beside either. Curves need no effect, or leave less by far beside one, or lines
+        are kept.
         """
-        there = Projector(other.regression, self.faults.noise).bounded()
-        left = there.off(there.residual)
-        whole, here = float(left @ left), float(self.left @ self.left)
+        there = other.in_noise_of(self)
+        whole, here, noise = (float(there.left @ there.left), float(self.left @ self.left), len(there.left))
+        if "zero" in other.holds:
+            # Of noise alone nothing would leave less.
+            if whole <= (1 + _NOISE) * noise:
+                return False
+            lines, steps = (min(one.left_beside_best, one.left_beside_lag()) for one in (self, there))
+            return lines < steps - max(self.thresholds.other_hold_z**2, _PLAIN * (steps - noise))
         # Where either leaves noise alone, that is not asked.
-        if min(here, whole) > (1 + _NOISE) * len(left):
-            near, far = self.left_beside_best, other.in_noise_of(self).left_beside_best
-            if is_far_less(min(near, far), max(near, far), len(left)):
+        if min(here, whole) > (1 + _NOISE) * noise:
+            near, far = self.left_beside_best, there.left_beside_best
+            if is_far_less(min(near, far), max(near, far), noise):
                 return near < far
         rest = whole - other.largest_z() ** 2
-        # Of noise alone nothing would leave less.
-        if rest <= (1 + _NOISE) * len(left):
+        if rest <= (1 + _NOISE) * noise:
             return False
-        if "zero" in other.holds:
-            # They need no parameter.
-            return self.left_beside_lag() < rest - _PLAIN * (rest - len(left))
         # Of what is more than noise either way, a small part decides nothing, unless the best effect explains less.
-        if here - whole < min(_NOISE * (here - len(left)), self.largest_z() ** 2):
+        if here - whole < min(_NOISE * (here - noise), self.largest_z() ** 2):
             return True
         beside = min(self.left_beside_lag(), self.left_beside_delay())
         return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)

@@ -169,10 +169,11 @@ def prepare_diagnosis(
             drop_programs(records)
         if rings:
             here, words = lagging(here, here.holds)
-        if here.may_be_held(reading.thresholds) and has_time():
+        steps = IN_STEPS * len(records)
+        if steps not in (here.holds, holds) and here.may_be_held(reading.thresholds) and has_time():
             progress("fitting the plain stage again, its command held between samples")
-            other = fitted(IN_STEPS * len(records), here.regression.baseline.problem)
-            here = other if other.explains_more(here) else here
+            other = fitted(steps, here.regression.baseline.problem)
+            here = other if other.explains_more(here) and not here.outdoes(other) else here
             drop_programs(records)
         if words == _DRIVER:
             [(_, driver)] = named_parts(here.regression.baseline.stage, Driver)

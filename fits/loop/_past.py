@@ -1,9 +1,10 @@
 """What an unknown past adds to a run: the relays that its voltage has not swept yet, as unknowns of a regression.
 
 Relays that switch between the lowest and the highest voltage that a run has reached are in known states. What the
-others add is constant until the voltage goes beyond: a function of the highest voltage so far plus one of the lowest,
-to first order in how much farther it goes each time. Both are cubic splines here, which end at nothing where the run
-does not go any farther; what is left then is a constant, which the sensor's offset takes up.
+others add is constant until the voltage goes beyond: a function of the highest voltage so far plus one of the lowest.
+Where the voltage has gone beyond on the other side in between, fewer relays are left on this one, and that function
+has a kink. Both are cubic splines here with some kinks, which end at nothing where the run does not go any farther;
+what is left then is a constant, which the sensor's offset takes up.
 """
 
 import jax
@@ -13,12 +14,16 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _DEGREE, _PIECES = 3, 5
+# Kinks of either function, the highest power of what begins at each, and the part of the way that is left there.
+_KINKS, _POWER, _LEFT = 4, 2, 0.02
 
 
 @jax.jit
 def past_columns(voltage_V: Float[Array, " n"]) -> Float[Array, "n k"]:
     """Signals of the unknown past of a hysteresis under a voltage, shape `(n, k)`."""
-    return jnp.concatenate([_spline(lax.cummax(voltage_V)), _spline(lax.cummin(voltage_V))], axis=1)
+    most, least = lax.cummax(voltage_V), lax.cummin(voltage_V)
+    columns = _spline(most), _kinks(most, -least), _spline(least), _kinks(-least, most)
+    return jnp.concatenate(columns, axis=1)
 
 
 def rough_past_columns(
@@ -52,6 +57,26 @@ def _spline(reached_V: Float[Array, " n"]) -> Float[Array, "n k"]:
         splines = rise * splines[:, :-1] + fall * splines[:, 1:]
     # All but the first vanish where nothing is left.
     return splines[:, 1:]
+
+
+def _kinks(reached_V: Float[Array, " n"], other_V: Float[Array, " n"]) -> Float[Array, "n k"]:
+    """What a run has still to go beyond its worst kinks, and the squares of that, shape `(n, k)`.
+
+    A kink is worse the farther the `other_V` has gone since the run was there, and the farther it is from both ends.
+    """
+    sample = jnp.arange(len(reached_V))
+    farther = jnp.diff(reached_V, prepend=reached_V[:1]) > 0
+    last = lax.cummax(jnp.where(farther, sample, 0))
+    before = jnp.concatenate([last[:1], last[:-1]])
+    at_V, gone_V = reached_V[before], other_V - other_V[before]
+    way_V, end_V = reached_V[-1] - reached_V[0], reached_V[-1]
+    least_V = jnp.minimum(at_V - reached_V[0], end_V - at_V)
+    worth = jnp.where(farther & (least_V > _LEFT * way_V), gone_V * least_V, 0.0)
+    most, which = lax.top_k(worth, min(_KINKS, len(reached_V)))
+    kink_V = jnp.where(most > 0, at_V[which], end_V)
+    width_V = jnp.where(most > 0, end_V - kink_V, 1.0)
+    left = (end_V - jnp.maximum(reached_V[:, None], kink_V[None])) / width_V[None]
+    return jnp.concatenate([left**power for power in range(1, _POWER + 1)], axis=1)
 
 
 def _inverse(width: np.ndarray) -> np.ndarray:

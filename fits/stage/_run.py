@@ -43,7 +43,10 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     place = place_of_hysteresis(stage)
     if samples.has_past and place is not None:
         seen = ahead(stage, place, samples)
-        past = past_columns(seen.values)
+        # How far a lagging command goes may show after what is fitted only: a kink there could not be learnt.
+        at_V, fitted = seen.values[:: samples.stride], samples.weight > 0
+        end_V = jnp.max(jnp.where(fitted, at_V, -jnp.inf)), jnp.min(jnp.where(fitted, at_V, jnp.inf))
+        past = past_columns(jnp.clip(seen.values, end_V[1], end_V[0]))
         offset = jnp.concatenate([offset, answered(stage, place, samples, past, seen)], axis=1)
     behind = stage.parts[0 if place is None else place + 1 :]
     if samples.moving:

@@ -25,13 +25,15 @@ from fits.stage._run import (
     yields_inside,
 )
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
-from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages
+from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages, with_lag_elsewhere
 from fits.stage._uncertainty import Precision
 from microid import Driver, Mechanics, Preisach, Stage, innermost
 from microid.effects import EFFECTS
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
+# What is left, in noise of the sensor, from which on a driver and a damped mode may have taken each other's place.
+_MORE = 1.5
 # How many times what a start leaves, on average, is too much beside one that has a lag of the reading, too.
 _BAD = 3.0
 # Part of the sampling interval below which a driver's time constant hardly shows behind steps.
@@ -158,7 +160,14 @@ def _freed(
     """
     runs, settings = solved.runs, (plan.loss, plan.progress)
     solved = try_chain(solved.onward, runs, *settings, rough=True) or solved
-    if not any(one.far for one in misfits(runs, solved.residuals_um)):
+    left = misfits(runs, solved.residuals_um)
+    elsewhere = with_lag_elsewhere(solved.stage) if any(one.times_noise > _MORE for one in left) else None
+    if elsewhere is not None:
+        start = replace(solved.onward, z=np.asarray(solved.problem.chain.coordinates.of(elsewhere)))
+        moved = try_chain(start, runs, *settings, rough=True)
+        if moved is not None and moved.cost < solved.cost:
+            solved, left = moved, misfits(runs, moved.residuals_um)
+    if not any(one.far for one in left):
         return solved
     beside = _beside_lag(plan, solved.onward, runs, responses)
     if beside is None or not _identifiable(beside, drives, fast):
@@ -238,12 +247,14 @@ def _lagging(plan: Plan, problem: Problem, runs: list[Run], drives: Sequence[np.
     """Fit hysteresis and driver together, without mechanics; None where the driver's lag does not show."""
     stage, grid = problem.stage, problem.chain.grid
     drivers, mechanics = (named_parts(stage, kind) for kind in (Driver, Mechanics))
-    if len(drivers) != 1 or len(mechanics) != 1 or grid is None or problem.hyper is None:
+    if len(drivers) != 1 or len(mechanics) > 1 or grid is None or problem.hyper is None:
         return None
-    (name, old), (dropped, _) = drivers[0], mechanics[0]
-    simple = stage.without(dropped).swap(name, Driver(jnp.asarray(3.0 * plan.interval_s), old.gain))
+    (name, old), remarks = drivers[0], tuple(_no_resonance(plan, dropped) for dropped, _ in mechanics)
+    for dropped, _ in mechanics:
+        stage = stage.without(dropped)
+    simple = stage.swap(name, Driver(jnp.asarray(3.0 * plan.interval_s), old.gain))
     simpler = Problem.of(simple, grid, problem.columns_um, problem.hyper, problem.stroke_um)
-    simpler = replace(simpler, least_noise_share=_EVEN, remarks=(_no_resonance(plan, dropped),))
+    simpler = replace(simpler, least_noise_share=_EVEN, remarks=remarks)
     plan.progress("a lag without a resonance")
     solved = try_chain(simpler, runs, plan.loss, plan.progress)
     if solved is None or not shows_poles(solved, drives) or float(np.max(Precision(solved).sd)) > UNSEEN:
