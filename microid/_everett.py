@@ -238,7 +238,9 @@ def _linear(table: Array, *place: Array) -> Array:
 
     # The implicit form has a cheap transpose, as that of `forest_sum`; what is solved for must be linear, zeros too.
     none = jnp.broadcast_to(0 * table[0], place[1].shape)
-    return lax.custom_linear_solve(residual, (table, none), solve, transpose_solve)[1]
+    same, read_off = lax.custom_linear_solve(residual, (table, none), solve, transpose_solve)
+    # JAX takes no cotangent for a symbolic zero there, which that of an output without use would be.
+    return read_off + 0 * same[0]
 
 
 def _gather_back(i: Array, s: Array, j: Array, t: Array, table: Array, cotangent: Array) -> Array:

@@ -155,7 +155,6 @@ def test_both_modes_agree_with_central_differences(rng):
     assert np.linalg.norm(expected[:, -FEW:]) > 1
 
 
-@pytest.mark.study
 def test_second_derivatives_agree_with_differences_of_the_first(rng):
     model = random_model(rng, levels=3)
     reference_um = spread_references(rng, model)[:5]

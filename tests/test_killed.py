@@ -189,6 +189,16 @@ def shown(folder):
     return {name: whole(folder / name) for name in names if not any(part.startswith(".") for part in name.parts)}
 
 
+@pytest.mark.parametrize(("sent", "said"), [(signal.SIGTERM, "Terminated"), (signal.SIGINT, "Interrupted")])
+def test_a_request_between_the_calls_of_a_command_ends_it_as_any_other(sent, said):
+    """The library that reads the command line ends with status 1 and a word of its own there."""
+    asked = f"main.cli.make_context = lambda *_, **__: os.kill(os.getpid(), {int(sent)})"
+    code = f"import os\nfrom fits.cli import _main as main\n{asked}\nmain.main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + sent
+    assert done.stderr.strip().startswith(said)
+
+
 # The command, one that starts in the same folder and is soon refused, and what it leaves in the end.
 COMMANDS = {
     "fit": ("fit csv/train.csv --levels 8 --out m.json --plots plots", "fit none.csv --out m.json --plots plots"),

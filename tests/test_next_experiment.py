@@ -137,7 +137,7 @@ def measured(run):
 def ready(records, noise_um):
     """What a diagnosis prepares, with three forms of effects only and a noise that is known."""
     range_V = min(r.voltage_V.min() for r in records), max(r.voltage_V.max() for r in records)
-    baseline = _baseline._static(records, (), range_V, 0.0, "unknown", True, (), lambda _: None)
+    baseline = _baseline._static(records, (), range_V, 0.0, "unknown", (True,) * len(records), (), lambda _: None)
     bench = Bench(baseline)
     scales = scales_of(bench, noise_um)
     forms = [form for form in EFFECTS if (form.name, form.form) in {("creep", ""), ("thermal_drift", "exponential")}]

@@ -55,7 +55,15 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     try:
         try:
-            cli(prog_name="microid")
+            # By itself click would end with status 1 where it is stopped between its own calls of a command.
+            status = cli(prog_name="microid", standalone_mode=False)
+            sys.exit(status if isinstance(status, int) else 0)
+        except click.ClickException as error:
+            error.show()
+            sys.exit(error.exit_code)
+        except click.Abort as abort:
+            stop = abort.__cause__
+            stopped(stop if isinstance(stop, KeyboardInterrupt) else KeyboardInterrupt(), NOTHING_LEFT)
         except KeyboardInterrupt as stop:
             stopped(stop, NOTHING_LEFT)
         except OSError as error:
