@@ -10,7 +10,7 @@ import pytest
 from fits import Record
 from fits.diagnosis._baseline import _hold_of, simulate
 from fits.diagnosis._plain_fit import PlainFit
-from fits.diagnosis._prepare import _hold_of_plateaus
+from fits.diagnosis._prepare import _beyond, _hold_of_plateaus
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._run import prepare_run
 from microid import Driver, Piezo, Stage
@@ -122,6 +122,22 @@ def test_a_command_that_mostly_stays_where_it_is_goes_in_steps():
     jumps, ramp = np.repeat([0.0, 5.0, 2.0], 4), np.linspace(0.0, 5.0, 12)
     assert _hold_of_plateaus(SimpleNamespace(voltage_V=jumps)) == "zero"
     assert _hold_of_plateaus(SimpleNamespace(voltage_V=ramp)) == "first"
+
+
+def test_a_run_held_out_that_goes_beyond_what_was_fitted_is_said_to():
+    low_V, high_V = -90.0, 92.0
+    volts = np.r_[np.linspace(low_V, high_V, 88), np.full(12, 150.0)]
+    fitted = Record(np.arange(100.0), volts, np.zeros(100), source="fitted.csv")
+    inside, little, far = (
+        SimpleNamespace(voltage_V=np.array([low_V, high_V + more]), source=f"{more:g}.csv")
+        for more in (-3.0, 1.0, 5.0)
+    )
+    below = SimpleNamespace(voltage_V=np.array([low_V - 6.0, high_V + 5.0]), source="below.csv")
+    assert not _beyond([fitted], [inside, little], 0.12)
+    # The end of the record, which is held out, too, is not what was fitted.
+    upper, lower = _beyond([fitted], [far, below], 0.12)
+    assert upper.startswith("5.csv goes to 97 V, and what was fitted from -90 to 92 V only")
+    assert lower.startswith("below.csv goes to -96 V")
 
 
 @pytest.mark.parametrize(("excess", "mixed"), [(80_000.0, True), (1_600_000.0, False)])

@@ -53,6 +53,12 @@ _CLOSED = (
     "a controller held the displacement, and what bends a loop cannot be told from a density there, which is asked "
     "only along the way that it took"
 )
+_BEYOND = (
+    "{} goes to {:.4g} V, and what was fitted from {:.4g} to {:.4g} V only: how it moves there, and what it "
+    "remembers of that, is not known from these runs, so that an error there says little of causes"
+)
+# Part of the range by which a run held out may go beyond what was fitted.
+_LITTLE = 0.01
 # Part of the intervals in which a command in steps stays where it is.
 _MOST = 0.5
 # Part of the samples held out at voltages through which it goes both ways in what is fitted.
@@ -112,6 +118,7 @@ def prepare_diagnosis(
     said: tuple[str, ...] = ()
     if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
         fraction, said = 0.0, (*said, ONE_WAY)
+    said = (*said, *_beyond(records, reading.aside, fraction))
 
     def fitted(holds: Holds, onward: Problem | None = None) -> PlainFit:
         settings = reading.aside, fraction, initial, progress, holds, reading.thresholds.model_error
@@ -206,6 +213,21 @@ def prepare_diagnosis(
     projector = Projector(regression, faults.noise, rough).bounded()
     projector = projector.beside(with_discrepancy(projector, candidates)).bounded()
     return Prepared(reading, baseline, regression, bench, projector, tuple(probes), faults, tuple(skipped))
+
+
+def _beyond(records: Sequence[Record], aside: Sequence[Record], fraction: float) -> list[str]:
+    """What to say of runs held out that go beyond the voltages that are fitted."""
+    fitted = [record.voltage_V[: len(record) - round(fraction * len(record))] for record in records]
+    low_V, high_V = min(float(each.min()) for each in fitted), max(float(each.max()) for each in fitted)
+    said = []
+    for record in aside:
+        ends_V = float(record.voltage_V.min()), float(record.voltage_V.max())
+        end_V, beyond_V = max(
+            zip(ends_V, (low_V - ends_V[0], ends_V[1] - high_V), strict=True), key=lambda one: one[1]
+        )
+        if beyond_V > _LITTLE * (high_V - low_V):
+            said.append(_BEYOND.format(record.source, end_V, low_V, high_V))
+    return said
 
 
 def _hold_of_plateaus(record: Record) -> Hold:
