@@ -25,13 +25,9 @@ from fits.diagnosis._misfit import SHOWN, worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
 from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared
 from fits.diagnosis._refit import Refit
-from fits.diagnosis._residual_tests import (
-    explain,
-    further_regressors,
-    irregular,
-    run_regressors,
-)
+from fits.diagnosis._residual_tests import explain, further_regressors, irregular, run_regressors
 from fits.diagnosis._result import Diagnosis, FoundCause, Gain, RunView, Step, Test, Verdict
+from fits.diagnosis._thresholds import Thresholds
 from fits.io._length import length
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
@@ -88,11 +84,11 @@ def conclude(
     # Of what one run had of its own other runs show nothing, unless it is so little that it may be what they lack.
     repeats = not any(map(is_own, extension.effects))
     seen = extension.compared if repeats or (weak and small) else extension.compared[: len(baseline.runs)]
-    # Both need the support of what was held out, and what is both needs more of it.
-    most_z = thresholds.worse_z * (1.0, -0.5, -1.0)[int(weak) + int(small)]
-    worse = predicts_worse(seen, most_z, thresholds.worse_share)
+    # Beside a rest of another kind any evidence looks large.
+    doubts = int(weak) + int(small) + int(left_over)
+    worse = predicts_worse(seen, _may_be_worse_z(doubts, thresholds), thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
-        why = f"what was held out is predicted {'no better' if weak or small else 'worse'} with that"
+        why = f"what was held out is predicted {'no better' if doubts else 'worse'} with that"
         if misfit.share < thresholds.explained_share:
             share = "hardly any" if misfit.share < SHOWN else f"only {100 * misfit.share:.0f} %"
             why = f"that explains {share} of it"
@@ -320,6 +316,14 @@ def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], rest
         for bad, um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
     )
     return replace(beside, spikes=spikes, heights_um=faults.heights_um)
+
+
+def _may_be_worse_z(doubts: int, thresholds: Thresholds) -> float:
+    """Standard deviations by which causes may predict worse, negative where they must predict better.
+
+    What is doubtful needs the support of what was held out, and what is so for more than one reason needs more of it.
+    """
+    return thresholds.worse_z * (1.0, -0.5, -1.0)[min(doubts, 2)]
 
 
 def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:

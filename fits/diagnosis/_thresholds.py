@@ -23,9 +23,9 @@ class Thresholds:
     chance_z
         Standard deviations up to which a sum of squares is above its mean, or a strength off zero, by chance.
     worse_z
-        Standard deviations by which an extension may predict held-out data worse, and by which one that hardly stands
-        out of the rest of the misfit, or is weak and small beside the noise, must predict them better; half as many
-        where it is one of these.
+        Standard deviations by which an extension may predict held-out data worse, and by which one must predict them
+        better that is weak, small beside the noise, or beside a rest that it does not explain; half as many where it
+        is one of these.
     worse_share
         Part of their mean square by which errors in held-out data may grow with an extension: what the data held out
         do not show changes by less than that, by chance.
