@@ -58,13 +58,26 @@ def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), we
 def test_what_the_rest_may_make_is_not_named(monkeypatch):
     chance = 40 + 3 * 80**0.5
     parts = {"transport_delay": 8000.0, "thermal_gain": 170.0, "creep": 90.0}
-    assert named_beside(monkeypatch, parts, chance + 2500.0) == ["transport_delay"]
+    every = {"helpful": [*parts]}
+    assert named_beside(monkeypatch, parts, chance + 2500.0, **every) == ["transport_delay"]
     assert named_beside(monkeypatch, parts, chance) == [*parts]
     # A third of what there is beside the others is more than a minor share.
-    assert named_beside(monkeypatch, parts, chance + 300.0) == ["transport_delay", "thermal_gain"]
+    assert named_beside(monkeypatch, parts, chance + 300.0, **every) == ["transport_delay", "thermal_gain"]
     # One cause alone is decided on by its share of the whole misfit; a hum is no other effect's misfit.
     assert named_beside(monkeypatch, {"creep": 90.0}, chance + 2500.0) == ["creep"]
-    assert named_beside(monkeypatch, {"creep": 8000.0, "mains_hum": 90.0}, chance + 2500.0) == ["creep", "mains_hum"]
+    hum = {"creep": 8000.0, "mains_hum": 90.0}
+    assert named_beside(monkeypatch, hum, chance + 2500.0, helpful=["creep"]) == ["creep", "mains_hum"]
+
+
+def test_beside_what_is_left_a_cause_is_named_only_where_it_predicts(monkeypatch):
+    """A rail of 0.4 V was, at 44 standard deviations, beside the steps of a converter that are in no library."""
+    parts, chance = {"creep": 8000.0, "driver_saturation": 4000.0}, 40 + 3 * 80**0.5
+    assert named_beside(monkeypatch, parts, chance) == [*parts]
+    assert named_beside(monkeypatch, parts, chance + 2500.0, helpful=["creep"]) == ["creep"]
+    assert named_beside(monkeypatch, parts, chance + 2500.0, helpful=[*parts]) == [*parts]
+    # What one run had of its own is seen in no other.
+    jump = {"creep": 8000.0, "zero_shift": 4000.0}
+    assert named_beside(monkeypatch, jump, chance + 2500.0, helpful=["creep"]) == [*jump]
 
 
 def test_what_predicts_worse_is_not_named_beside_others(monkeypatch):

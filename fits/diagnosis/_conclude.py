@@ -84,8 +84,8 @@ def conclude(
     # Of what one run had of its own other runs show nothing, unless it is so little that it may be what they lack.
     repeats = not any(map(is_own, extension.effects))
     seen = extension.compared if repeats or (weak and small) else extension.compared[: len(baseline.runs)]
-    # Beside a rest of another kind any evidence looks large.
-    doubts = int(weak) + int(small) + int(left_over)
+    # Beside a rest of another kind any evidence looks large; of what one run had of its own others say nothing.
+    doubts = int(weak) + int(small) + int(left_over and repeats)
     worse = predicts_worse(seen, _may_be_worse_z(doubts, thresholds), thresholds.worse_share)
     if kept and (misfit.share < thresholds.explained_share or worse):
         why = f"what was held out is predicted {'no better' if doubts else 'worse'} with that"

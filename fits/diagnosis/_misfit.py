@@ -122,8 +122,16 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     if weak and small and improvement_z(before, after) < thresholds.worse_z:
         why = "it is weak and small, and nothing that was held out is predicted better with it"
         return -1 / max(explained, 1e-300), name, why
+    card = card_of(name)
+    # Beside a rest of another kind any evidence looks large; of what one run had of its own others say nothing.
+    alike = misfit.is_left_over and not (card.independent or card.per_run)
+    if alike and improvement_z(before, after) < thresholds.worse_z / 2:
+        why = (
+            "something else is left, and what was held out is predicted no better with it than with the other causes"
+        )
+        return -1 / max(explained, 1e-300), name, why
     part = replace(misfit, explained=explained).share
-    if card_of(name).independent or part >= thresholds.minor_share:
+    if card.independent or part >= thresholds.minor_share:
         return None
     share = f"{100 * part:.0f} %" if part > SHOWN else "hardly any"
     return (

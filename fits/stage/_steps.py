@@ -119,6 +119,12 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     responses = [measure_response(runs[k], drives[k]) for k in fast]
     starts = [Problem.of(one, grid, columns, None, stroke) for one in start_stages(stage, responses)]
     solved = replace(_best_start(plan, starts, runs), hyper=hyper)
+    if fitted is not None and fast == slow and any(one.far for one in misfits(runs, solved.residuals_um)):
+        # A hysteresis read off runs that are all as fast has taken in their lag, which the command itself shows.
+        plain = start_stages(stage, [measure_response(runs[k], runs[k].voltage_V) for k in fast])
+        starts += [Problem.of(one, grid, columns, None, stroke) for one in plain]
+        free = (try_chain(replace(one, hyper=hyper), runs, plan.loss, plan.progress, rough=True) for one in starts)
+        solved = min(filter(None, (solved, *free)), key=lambda one: one.cost)
     problem = solved.onward
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
