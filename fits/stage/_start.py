@@ -18,8 +18,8 @@ _LINES = 6
 _SAME = 0.05
 # Lines of a response that are kept, spread evenly over the logarithm of the frequency and around the largest.
 _MOST_LINES = 240
-# Damping ratio of a mode that takes up little of the lag.
-_LIGHT = 0.03
+# Damping ratio of a mode that takes up little of the lag, and the part of the lag that is little.
+_LIGHT, _LITTLE = 0.03, 0.3
 
 
 @dataclass(frozen=True)
@@ -115,24 +115,25 @@ def start_lagging(stage: Stage, responses: Sequence[MeasuredResponse]) -> list[t
     return [(problem.applied(stage, moved, x), float(np.exp(x[-1]))) for x in _distinct(swapped, _SAME)]
 
 
-def with_lag_elsewhere(stage: Stage) -> Stage | None:
-    """The same stage with most of its lag in the damping of its mode if that was in the driver, or the other way.
+def with_lag_elsewhere(stage: Stage) -> list[Stage]:
+    """The same stage with all but a little of its lag in the driver, or in the damping of its mode, if it was not.
 
     Below the resonance a driver and a damped mode delay alike. None unless both are there, and free.
     """
     drivers, modes = named_parts(stage, Driver), named_parts(stage, Mechanics)
     if len(drivers) != 1 or len(modes) != 1 or not {drivers[0][0], modes[0][0]} <= {*_moved(stage)}:
-        return None
+        return []
     (name, driver), (place, mode) = drivers[0], modes[0]
     per_damping_s = 1 / (np.pi * float(mode.natural_frequency_Hz))
     ahead_s, behind_s = float(driver.time_constant_s), float(mode.damping_ratio) * per_damping_s
-    light_s = _LIGHT * per_damping_s
-    if behind_s > ahead_s:
-        ahead_s, behind_s = max(ahead_s + behind_s - light_s, light_s), light_s
-    else:
-        ahead_s, behind_s = light_s, max(ahead_s + behind_s - light_s, light_s)
-    stage = stage.swap(name, replace(driver, time_constant_s=jnp.asarray(ahead_s)))
-    return stage.swap(place, replace(mode, damping_ratio=jnp.asarray(behind_s / per_damping_s)))
+    little_s = min(_LIGHT * per_damping_s, _LITTLE * (ahead_s + behind_s))
+    found = []
+    for here_s, there_s in ((ahead_s + behind_s - little_s, little_s), (little_s, ahead_s + behind_s - little_s)):
+        if min(here_s / ahead_s, there_s / behind_s) > 0.5:
+            continue
+        other = stage.swap(name, replace(driver, time_constant_s=jnp.asarray(here_s)))
+        found.append(other.swap(place, replace(mode, damping_ratio=jnp.asarray(there_s / per_damping_s))))
+    return found
 
 
 def _moved(stage: Stage) -> list[str]:

@@ -144,8 +144,10 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
             raise
         refuse_unidentifiable(beside, drives, fast=fast != slow)
         return _without_lag(problem, beside)
-    if fitted is not None and any(one.far for one in misfits(runs, solved.residuals_um)):
-        freed = _freed(plan, solved, drives, responses, fast != slow)
+    if fitted is not None:
+        freed = _lag_placed(plan, solved)
+        if any(one.far for one in misfits(runs, freed.residuals_um)):
+            freed = _freed(plan, freed, drives, responses, fast != slow)
         if plan.accept_best or _identifiable(freed, drives, fast != slow):
             solved, dropped = freed, None
             problem = solved.onward
@@ -157,6 +159,20 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
 
 
+def _lag_placed(plan: Plan, solved: Solved) -> Solved:
+    """Go on from a rough fit with the hysteresis free, and with the lag in the driver or in the mode."""
+    runs, settings = solved.runs, (plan.loss, plan.progress)
+    solved = try_chain(solved.onward, runs, *settings, rough=True) or solved
+    if not any(one.times_noise > _MORE for one in misfits(runs, solved.residuals_um)):
+        return solved
+    found = [solved]
+    for stage in with_lag_elsewhere(solved.stage):
+        start = replace(solved.onward, z=np.asarray(solved.problem.chain.coordinates.of(stage)))
+        if moved := try_chain(start, runs, *settings, rough=True):
+            found.append(moved)
+    return min(found, key=lambda one: one.cost)
+
+
 def _freed(
     plan: Plan, solved: Solved, drives: Sequence[np.ndarray], responses: Sequence[MeasuredResponse], fast: bool
 ) -> Solved:
@@ -165,16 +181,6 @@ def _freed(
     What a fit in a bad minimum leaves looks like many things; beside a lag of the reading it may find the poles.
     """
     runs, settings = solved.runs, (plan.loss, plan.progress)
-    solved = try_chain(solved.onward, runs, *settings, rough=True) or solved
-    left = misfits(runs, solved.residuals_um)
-    elsewhere = with_lag_elsewhere(solved.stage) if any(one.times_noise > _MORE for one in left) else None
-    if elsewhere is not None:
-        start = replace(solved.onward, z=np.asarray(solved.problem.chain.coordinates.of(elsewhere)))
-        moved = try_chain(start, runs, *settings, rough=True)
-        if moved is not None and moved.cost < solved.cost:
-            solved, left = moved, misfits(runs, moved.residuals_um)
-    if not any(one.far for one in left):
-        return solved
     beside = _beside_lag(plan, solved.onward, runs, responses)
     if beside is None or not _identifiable(beside, drives, fast):
         return solved
