@@ -36,6 +36,8 @@ _EVEN = 1.0
 _MORE = 1.5
 # How many times what a start leaves, on average, is too much beside one that has a lag of the reading, too.
 _BAD = 3.0
+# How many times what is left beside a mode, on average, must be left beside a lag of the reading instead.
+_CLEAR = 1.1
 # Part of the sampling interval below which a driver's time constant hardly shows behind steps.
 _SETTLED = 0.2
 # Steps per sample that a fit takes at most.
@@ -119,17 +121,14 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     responses = [measure_response(runs[k], drives[k]) for k in fast]
     starts = [Problem.of(one, grid, columns, None, stroke) for one in start_stages(stage, responses)]
     solved = replace(_best_start(plan, starts, runs), hyper=hyper)
-    if fitted is not None and fast == slow and any(one.far for one in misfits(runs, solved.residuals_um)):
-        # A hysteresis read off runs that are all as fast has taken in their lag, which the command itself shows.
-        plain = start_stages(stage, [measure_response(runs[k], runs[k].voltage_V) for k in fast])
-        starts += [Problem.of(one, grid, columns, None, stroke) for one in plain]
-        free = (try_chain(replace(one, hyper=hyper), runs, plan.loss, plan.progress, rough=True) for one in starts)
-        solved = min(filter(None, (solved, *free)), key=lambda one: one.cost)
     problem = solved.onward
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
+        other = _from_command(plan, problem, runs, responses, starts) if fast == slow else None
+        if other is not None and _identifiable(other, drives, False):
+            return _lag_placed(plan, other).onward
         if not plan.accept_best:
             if fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
                 return lagging
@@ -159,6 +158,29 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
 
 
+def _from_command(
+    plan: Plan, problem: Problem, runs: list[Run], responses: Sequence[MeasuredResponse], starts: Sequence[Problem]
+) -> Solved | None:
+    """Go on from poles that the command itself shows, the hysteresis free.
+
+    None without a mode that has a peak, or where hardly more is left beside a lag of the reading instead.
+    """
+    if problem.chain.grid is None or problem.hyper is None:
+        return None
+    shown = start_stages(problem.stage, [measure_response(run, run.voltage_V) for run in runs])
+    places, found = [*(start.z for start in starts), *(problem.chain.coordinates.of(one) for one in shown)], []
+    for z in places:
+        one = try_chain(replace(problem, z=np.asarray(z)), runs, plan.loss, plan.progress, rough=True)
+        if one and all(float(mode.damping_ratio) < 0.5**0.5 for _, mode in named_parts(one.stage, Mechanics)):
+            found.append(one)
+    beside = _beside_lag(plan, problem, runs, responses)
+    if not found or beside is None:
+        return None
+    best = min(found, key=lambda one: one.cost)
+    least = math.log(_CLEAR) * sum(int(run.fitted.sum()) for run in runs)
+    return best if best.cost < beside.cost - least else None
+
+
 def _lag_placed(plan: Plan, solved: Solved) -> Solved:
     """Go on from a rough fit with the hysteresis free, and with the lag in the driver or in the mode."""
     runs, settings = solved.runs, (plan.loss, plan.progress)
@@ -180,12 +202,11 @@ def _freed(
 
     What a fit in a bad minimum leaves looks like many things; beside a lag of the reading it may find the poles.
     """
-    runs, settings = solved.runs, (plan.loss, plan.progress)
+    runs = solved.runs
     beside = _beside_lag(plan, solved.onward, runs, responses)
     if beside is None or not _identifiable(beside, drives, fast):
         return solved
-    other = _without_lag(solved.onward, beside)
-    there = try_chain(other, runs, *settings, rough=True)
+    there = try_chain(_without_lag(solved.onward, beside), runs, plan.loss, plan.progress, rough=True)
     least = math.log(_BAD) * sum(int(run.fitted.sum()) for run in runs)
     if there is not None and (there.cost < solved.cost or solved.cost - beside.cost > least):
         return there
