@@ -193,7 +193,9 @@ def shown(folder):
 def test_a_request_between_the_calls_of_a_command_ends_it_as_any_other(sent, said):
     """The library that reads the command line ends with status 1 and a word of its own there."""
     asked = f"main.cli.make_context = lambda *_, **__: os.kill(os.getpid(), {int(sent)})"
-    code = f"import os\nfrom fits.cli import _main as main\n{asked}\nmain.main()"
+    # In the background a shell has it ignored.
+    heard = "signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"import os, signal\nfrom fits.cli import _main as main\n{heard}\n{asked}\nmain.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 128 + sent
     assert done.stderr.strip().startswith(said)
