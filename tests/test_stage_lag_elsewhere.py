@@ -39,6 +39,15 @@ def test_the_lag_goes_where_it_was_not_and_stays_as_long(lag, places):
         assert float(other["mechanics"].natural_frequency_Hz) == lag[1]
 
 
+@pytest.mark.parametrize("lag", [(1e-9, 2.5e8, 4e5), (2e-4, 2.5e8, 0.5), (1e-9, 1e5, 1e-4), (1e-4, 300.0, 0.0)])
+def test_a_mode_far_beyond_all_samples_keeps_to_the_bounds(lag):
+    """Fits of runs that show no resonance end there: a driver of 0.04 ns had been an error."""
+    stage = stage_of(*lag)
+    for other in with_lag_elsewhere(stage):
+        assert lags_s(other).sum() == pytest.approx(lags_s(stage).sum(), rel=1e-9)
+        assert float(other["driver"].time_constant_s) >= 1e-9
+
+
 def test_a_stage_without_both_has_no_other_place():
     stage = stage_of(1e-3, 120.0, 0.05)
     assert with_lag_elsewhere(stage.without("driver")) == []

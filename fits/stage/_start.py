@@ -20,6 +20,8 @@ _SAME = 0.05
 _MOST_LINES = 240
 # Damping ratio of a mode that takes up little of the lag, and the part of the lag that is little.
 _LIGHT, _LITTLE = 0.03, 0.3
+# Lags that are no longer than this are none: a driver has some.
+_SHORTEST_s = 1e-8
 
 
 @dataclass(frozen=True)
@@ -126,10 +128,11 @@ def with_lag_elsewhere(stage: Stage) -> list[Stage]:
     (name, driver), (place, mode) = drivers[0], modes[0]
     per_damping_s = 1 / (np.pi * float(mode.natural_frequency_Hz))
     ahead_s, behind_s = float(driver.time_constant_s), float(mode.damping_ratio) * per_damping_s
-    little_s = min(_LIGHT * per_damping_s, _LITTLE * (ahead_s + behind_s))
-    found = []
+    little_s, found = max(min(_LIGHT * per_damping_s, _LITTLE * (ahead_s + behind_s)), _SHORTEST_s), list[Stage]()
+    if little_s > _LITTLE * (ahead_s + behind_s):
+        return found
     for here_s, there_s in ((ahead_s + behind_s - little_s, little_s), (little_s, ahead_s + behind_s - little_s)):
-        if min(here_s / ahead_s, there_s / behind_s) > 0.5:
+        if here_s > ahead_s / 2 and there_s > behind_s / 2:
             continue
         other = stage.swap(name, replace(driver, time_constant_s=jnp.asarray(here_s)))
         found.append(other.swap(place, replace(mode, damping_ratio=jnp.asarray(there_s / per_damping_s))))
