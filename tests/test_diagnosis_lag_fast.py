@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
+from _lags import through
 
 from fits import Record, diagnose
 
@@ -13,12 +13,6 @@ TURNS_V = 0, 100, 0, 100, 75, 100, 50, 100, 25, 100, 0, 85, 15, 75, 25, 60, 40, 
 def ways_V(turns_V, rate_V_per_s, rate_Hz):
     way_V = np.r_[0, np.cumsum(np.abs(np.diff(turns_V)))]
     return np.interp(np.arange(0, way_V[-1], rate_V_per_s / rate_Hz), way_V, turns_V)
-
-
-def through(above, below, values, rate_Hz):
-    """Exact for what runs in lines between the samples."""
-    over, under, _ = cont2discrete((above, below), 1 / rate_Hz, "foh")
-    return lfilter(np.ravel(over), under, values - values[0]) + values[0]
 
 
 def measured(rng, voltage_V, rate_Hz, lags_s, natural, damping, source, warmer=0.0, warm_s=1.0):

@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
+from _lags import through
 
 import fits
 
 RATE_Hz, NOISE_um, SUBSTEPS = 10_000.0, 2e-3, 8
 NAMES = "driver.time_constant_s", "mechanics.natural_frequency_Hz", "mechanics.damping_ratio"
-
-
-def through(above, below, values, rate_Hz):
-    """Exact for what runs in lines between the samples."""
-    over, under, _ = cont2discrete((above, below), 1 / rate_Hz, "foh")
-    return lfilter(np.ravel(over), under, values - values[0]) + values[0]
 
 
 def measured(rng, voltage_V, tau_s, natural_Hz, damping, source):

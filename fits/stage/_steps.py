@@ -1,8 +1,9 @@
 """The two halves of fitting a stage: a place to begin, read off the runs, and the joint fit from there."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import jax.numpy as jnp
@@ -122,11 +123,12 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
     starts = [Problem.of(one, grid, columns, None, stroke) for one in start_stages(stage, responses)]
     solved = replace(_best_start(plan, starts, runs), hyper=hyper)
     problem = solved.onward
+    lag_beside = cache(lambda: _beside_lag(plan, problem, runs, responses))
     try:
         dropped = refuse_unidentifiable(solved, drives, fast=fast != slow, may_drop=not plan.accept_best)
     except DataError:
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
-        other = _from_command(plan, problem, runs, responses, starts) if fast == slow else None
+        other = _from_command(plan, problem, runs, starts, lag_beside) if fast == slow else None
         if other is not None and _identifiable(other, drives, False):
             return _lag_placed(plan, other).onward
         if not plan.accept_best:
@@ -136,7 +138,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         lagged = None if fast == slow else _without_mechanics(plan, solved, asked, levels, finest, runs)
         if lagged is not None and not any(one.far for one in misfits(runs, lagged.residuals_um)):
             return lagged.onward
-        beside = _beside_lag(plan, problem, runs, responses)
+        beside = lag_beside()
         if lagged is not None and (beside is None or not _identifiable(beside, drives, fast != slow)):
             return lagged.onward
         if beside is None:
@@ -159,7 +161,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
 
 
 def _from_command(
-    plan: Plan, problem: Problem, runs: list[Run], responses: Sequence[MeasuredResponse], starts: Sequence[Problem]
+    plan: Plan, problem: Problem, runs: list[Run], starts: Sequence[Problem], lag_beside: Callable[[], Solved | None]
 ) -> Solved | None:
     """Go on from poles that the command itself shows, the hysteresis free.
 
@@ -173,8 +175,7 @@ def _from_command(
         one = try_chain(replace(problem, z=np.asarray(z)), runs, plan.loss, plan.progress, rough=True)
         if one and all(float(mode.damping_ratio) < 0.5**0.5 for _, mode in named_parts(one.stage, Mechanics)):
             found.append(one)
-    beside = _beside_lag(plan, problem, runs, responses)
-    if not found or beside is None:
+    if not found or (beside := lag_beside()) is None:
         return None
     best = min(found, key=lambda one: one.cost)
     least = math.log(_CLEAR) * sum(int(run.fitted.sum()) for run in runs)
@@ -187,12 +188,9 @@ def _lag_placed(plan: Plan, solved: Solved) -> Solved:
     solved = try_chain(solved.onward, runs, *settings, rough=True) or solved
     if not any(one.times_noise > _MORE for one in misfits(runs, solved.residuals_um)):
         return solved
-    found = [solved]
-    for stage in with_lag_elsewhere(solved.stage):
-        start = replace(solved.onward, z=np.asarray(solved.problem.chain.coordinates.of(stage)))
-        if moved := try_chain(start, runs, *settings, rough=True):
-            found.append(moved)
-    return min(found, key=lambda one: one.cost)
+    places = [np.asarray(solved.problem.chain.coordinates.of(stage)) for stage in with_lag_elsewhere(solved.stage)]
+    moved = (try_chain(replace(solved.onward, z=z), runs, *settings, rough=True) for z in places)
+    return min(filter(None, (solved, *moved)), key=lambda one: one.cost)
 
 
 def _freed(
