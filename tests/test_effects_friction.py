@@ -44,11 +44,36 @@ def test_a_state_of_bouc_and_wen_stays_behind_the_voltage(rng, sigma, exponent, 
 
     # Up from the lower end of the range to where the record begins, and along it.
     lower = float(hysteresis.density.lower_V)
-    states = [-((1 - 2 * asymmetry) ** (-1 / exponent))]
-    for before, there in pairwise([lower, *voltage]):
-        way = np.sign(there - before)
-        found = integrate.solve_ivp(lambda _, z, way=way: slope(z[0], way), (before, there), states[-1:], rtol=1e-9)
-        states.append(found.y[0, -1])
+    states = followed([lower, *voltage], -((1 - 2 * asymmetry) ** (-1 / exponent)), lambda _, z, way: slope(z, way))
     given = through(hysteresis, 1e-3, voltage)
-    expected = given - amplitude * np.array(states[1:][: len(voltage)])
-    np.testing.assert_allclose(through(effect, 1e-3, voltage), expected, atol=1e-4 * amplitude)
+    np.testing.assert_allclose(through(effect, 1e-3, voltage), given - amplitude * states, atol=1e-4 * amplitude)
+
+
+@pytest.mark.parametrize(("gain", "loss"), [((0.4, -0.2), (0.0, 0.0)), ((-0.3, 0.25), (0.3, -0.15))])
+def test_its_gain_and_loss_vary_with_the_voltage(rng, gain, loss):
+    hysteresis, voltage = random_model(rng, 8), wander(rng, 300, 10, 90)
+    lower, amplitude, length = float(hysteresis.density.lower_V), 2.0, 20.0
+    span = float(hysteresis.density.upper_V) - lower
+    effect = BY_NAME["bouc_wen_hysteresis", ""](
+        *(hysteresis, amplitude, length / span, 0.8, 1.4, span, 0.0, 0.0), *gain, *loss, lower
+    )
+
+    def slope(volt, z, way):
+        one, two = (np.polynomial.legendre.legval(2 * (volt - lower) / span - 1, [1, *some]) for some in (gain, loss))
+        return (one - two * abs(z) ** 1.4 * (0.2 + 0.8 * np.sign(z) * way)) / length
+
+    places = np.linspace(-1, 1, 1001)
+    first = [np.polynomial.legendre.legval(places, [1, *some]) for some in (gain, loss)]
+    states = followed([lower, *voltage], -(np.max(first[0] / first[1]) ** (1 / 1.4)), slope)
+    given = through(hysteresis, 1e-3, voltage)
+    np.testing.assert_allclose(through(effect, 1e-3, voltage), given - amplitude * states, atol=1e-3 * amplitude)
+
+
+def followed(voltage, first, slope):
+    """States at all voltages but the first by adaptive integration along the voltage."""
+    states = [first]
+    for before, there in pairwise(voltage):
+        way = np.sign(there - before)
+        found = integrate.solve_ivp(lambda u, z, w=way: slope(u, z, w), (before, there), states[-1:], rtol=1e-9)
+        states.append(found.y[0, -1])
+    return np.array(states[1:])

@@ -3,6 +3,7 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -16,6 +17,10 @@ from microid.effects._grids import _decades
 # Steps of the classical Runge-Kutta rule per sample, and per move before the record.
 _SUBSTEPS, _PAST_SUBSTEPS = 2, 32
 _SMALL = 1e-12
+# Gain and loss vary by so much at most, and are no less than this.
+_VARIED, _LEAST = 2.0, 0.02
+# Places in the range at which the farthest limit of the state is looked for.
+_PLACES = np.linspace(-1, 1, 17)
 
 
 @register
@@ -23,13 +28,15 @@ class BoucWenHysteresis(AbstractEffect):
     r"""A hysteresis beside whose displacement `w` a state of Bouc and Wen stays behind the voltage: `w - a z`.
 
     .. math::
-        l \frac{dz}{du} = 1 - |z|^n \left(1 - \sigma + \sigma\, \mathrm{sgn}(z \dot u)
+        l \frac{dz}{du} = g(u) - p(u) |z|^n \left(1 - \sigma + \sigma\, \mathrm{sgn}(z \dot u)
         + \phi\, (\mathrm{sgn}\, \dot u + \mathrm{sgn}\, z)\right)
 
     It forgets reversals by and by, where a Preisach operator wipes them out or keeps them: its minor loops do not
-    close, and those between the same voltages differ. With `sigma` and `n` of one it is Dahl's law, and that of
-    Coleman and Hodgdon with straight curves. Before the record the voltage went along what the memory of a `Preisach`
-    holds, from where it had come down for long; ahead of another law it had just done so.
+    close, and those between the same voltages differ. Gain and loss, `g` and `p`, are parabolas with a mean of one
+    over the range, :math:`1 + a x + b (3 x^2 - 1) / 2` for `x` from -1 to 1. With `sigma` and `n` of one it is Dahl's
+    law, and with a gain that varies that of Coleman and Hodgdon, whose curves are not straight. Before the record the
+    voltage went along what the memory of a `Preisach` holds, from where it had come down for long; ahead of another
+    law it had just done so.
 
     Attributes
     ----------
@@ -50,6 +57,12 @@ class BoucWenHysteresis(AbstractEffect):
         `phi`, by which rising branches bend more than falling ones.
     before
         What `z` was before the first sample, beyond what the memory tells.
+    gain_tilt, gain_bend
+        `a` and `b` of the gain: the part is wider where that is larger.
+    loss_tilt, loss_bend
+        Those of the loss: the part turns sooner where that is larger.
+    lower_V
+        Where the range begins, given.
     """
 
     name: ClassVar[str] = "bouc_wen_hysteresis"
@@ -80,6 +93,11 @@ class BoucWenHysteresis(AbstractEffect):
     range_V: Float[Array, ""] = array()
     asymmetry: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.45, upper=0.45, default=0.0)
     before: Float[Array, ""] = param(unit="1", lower=-2.0, upper=2.0, default=0.0)
+    gain_tilt: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    gain_bend: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    loss_tilt: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    loss_bend: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    lower_V: Float[Array, ""] = array(default=0.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -87,9 +105,9 @@ class BoucWenHysteresis(AbstractEffect):
         if inner is None:
             return ()
         size, sigma, exponent = (jnp.asarray(x) for x in (0.01 * scales.stroke_um, 0.75, 1.4))
-        range_V = jnp.asarray(scales.upper_V - scales.lower_V)
+        range_V, lower_V = jnp.asarray(scales.upper_V - scales.lower_V), jnp.asarray(scales.lower_V)
         grid = _decades(0.06, 1.0, 2)
-        return tuple((cls(inner, size, jnp.asarray(x), sigma, exponent, range_V),) for x in grid)
+        return tuple((cls(inner, size, jnp.asarray(x), sigma, exponent, range_V, lower_V=lower_V),) for x in grid)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Answer as the hysteresis does, less what stays behind."""
@@ -105,33 +123,47 @@ class BoucWenHysteresis(AbstractEffect):
         return given.with_values(given.values - self.amplitude_um * states, given.before - self.amplitude_um * state)
 
     def _limit(self, way: float) -> Float[Array, ""]:
-        """What the state approaches as the voltage goes up or down."""
-        return way * jnp.exp(-jnp.log1p(2 * way * self.asymmetry) / self.exponent)
+        """The farthest that the state approaches as the voltage goes up or down."""
+        gain, loss = self._varied(jnp.asarray(_PLACES))
+        most = jnp.log(jnp.max(gain / loss))
+        return way * jnp.exp((most - jnp.log1p(2 * way * self.asymmetry)) / self.exponent)
+
+    def _varied(self, place: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Gain and loss at places in the range, from -1 to 1."""
+        bent = (3 * place**2 - 1) / 2
+        gain = 1 + self.gain_tilt * place + self.gain_bend * bent
+        loss = 1 + self.loss_tilt * place + self.loss_bend * bent
+        return jnp.maximum(gain, _LEAST), jnp.maximum(loss, _LEAST)
 
     def _along(self, state: Float[Array, ""], voltage_V: Float[Array, " t"], substeps: int) -> Float[Array, " t-1"]:
         """The state at all voltages but the first, at which it is given."""
         lowest, highest = self._limit(-1.0), self._limit(1.0)
+        places = jnp.clip(2 * (voltage_V - self.lower_V) / self.range_V - 1, -1, 1)
 
-        def slope(z: Array, way: Array) -> Array:
+        def slope(z: Array, way: Array, place: Array) -> Array:
             # Within the limits it never goes back, however long a step is.
             z = jnp.clip(z, lowest, highest)
             size, side = jnp.abs(z), jnp.sign(z)
             # The logarithm has no derivative at zero, where the power has.
             at_zero = size < _SMALL
             power = jnp.where(at_zero, 0.0, jnp.exp(self.exponent * jnp.log(jnp.where(at_zero, 1.0, size))))
-            return 1 - power * (1 - self.sigma + self.sigma * side * way + self.asymmetry * (way + side))
+            gain, loss = self._varied(place)
+            return gain - loss * power * (1 - self.sigma + self.sigma * side * way + self.asymmetry * (way + side))
 
-        def visit(z: Array, move_V: Array) -> tuple[Array, Array]:
+        def visit(z: Array, move: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            move_V, first, last = move
             step, way = move_V / (self.length_share * self.range_V * substeps), jnp.sign(move_V)
+            on = (last - first) / substeps
 
-            def go(_: int, z: Array) -> Array:
-                k1 = slope(z, way)
-                k2 = slope(z + step * k1 / 2, way)
-                k3 = slope(z + step * k2 / 2, way)
-                k4 = slope(z + step * k3, way)
+            def go(number: int, z: Array) -> Array:
+                place = first + number * on
+                k1 = slope(z, way, place)
+                k2 = slope(z + step * k1 / 2, way, place + on / 2)
+                k3 = slope(z + step * k2 / 2, way, place + on / 2)
+                k4 = slope(z + step * k3, way, place + on)
                 return jnp.clip(z + step * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest)
 
             z = lax.fori_loop(0, substeps, go, z)
             return z, z
 
-        return lax.scan(visit, state, jnp.diff(voltage_V))[1]
+        return lax.scan(visit, state, (jnp.diff(voltage_V), places[:-1], places[1:]))[1]
