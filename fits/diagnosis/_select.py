@@ -105,17 +105,18 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
     }
     beyond = model.cost - projector.count + projector.freedom
     chance = thresholds.chance_z * (2 * projector.count) ** 0.5
+    # What explains most of all that is left may be asked below that: it holds if then nothing but noise is left.
+    asked = dict(bars)
     for scored in one.left if taken and beyond > chance else ():
-        # What leaves nothing but noise of nearly all that is left explains more than an error of a model looks like.
-        is_all = scored.drop > max((1 - thresholds.minor_share) * beyond, beyond - chance)
-        if is_all and model_error(scored.name, alike, thresholds) == thresholds.model_error:
-            bars[scored.form] = min(bars[scored.form], thresholds.strong_z)
+        is_most = scored.drop > (1 - thresholds.minor_share) * beyond
+        if is_most and model_error(scored.name, alike, thresholds) == thresholds.model_error:
+            asked[scored.form] = min(bars[scored.form], thresholds.strong_z)
     # Noise that was read too low makes chance look like evidence: what is left says how low at most.
     sigma = max((model.cost / max(projector.count - projector.freedom, 1.0)) ** 0.5, 1.0)
     room = len(one.names) < thresholds.most_causes and len(one.causes) < _MOST_LAWS
     for _ in range(_TRIES if room else 0):
         closed = (taken & _ONCE) | refused
-        open_ = [s for s in one.left if s.name not in closed and s.z > bars[s.form]]
+        open_ = [s for s in one.left if s.name not in closed and s.z > asked[s.form]]
         best = max(open_, key=lambda s: s.z, default=None)
         if best is None or one.family.p(best.z / sigma) >= false_alarm or not search.has_time():
             break
@@ -129,7 +130,7 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
         search.progress(f"fitting the effects that explain most ({top:.1f} standard deviations)")
         if bench.baseline.dynamic:
             # A lag that the poles have taken over shows nothing here, but its fit begins elsewhere.
-            open_ += [s for s in one.left if s.form.lag and s.name not in closed and s.z <= bars[s.form]]
+            open_ += [s for s in one.left if s.form.lag and s.name not in closed and s.z <= asked[s.form]]
         fitted = compare_rivals(
             bench, projector, model, open_, _MOST_LAWS - len(one.causes), thresholds, search.has_time
         )
@@ -151,7 +152,8 @@ def _grown(one: Explanation, search: Search, known: Collection[frozenset[str]]) 
             # What it explains is lost where all is fitted together, or it explains less than its score promised.
             new = end[-1].laws[len(one.causes) :]
             z = float(standard_deviations(drop, sum(law.size for law in new)))
-            if model.cost - end[-1].cost < thresholds.minor_share * drop or z <= bars[rival.form]:
+            bar = asked[rival.form] if is_noise else bars[rival.form]
+            if model.cost - end[-1].cost < thresholds.minor_share * drop or z <= bar:
                 continue
             if one.family.p(z / sigma) >= false_alarm or rival.criterion > one.criterion:
                 continue
