@@ -6,16 +6,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from microid._part import AbstractPart, Signal
+from microid._part import AbstractPart, Signal, innermost
+from microid._preisach import Preisach
 
 # Levels of the sweep, and its interval: so slow that no effect of the rate is left.
 _LEVELS, _SLOW_S = 65, 1e4
 
 
 def _anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
-    """Mean of the two branches of the loop over the range of a voltage, in um, at the voltages of the signal."""
+    """Mean of the two branches of the largest loop, in um, at the voltages of the signal.
+
+    That of a `Preisach` goes over the range of its density, the same in all runs, and that of another law over the
+    range of the signal.
+    """
     low = jnp.minimum(jnp.min(signal.values), signal.before)
-    step = (jnp.maximum(jnp.max(signal.values), signal.before) - low) / (_LEVELS - 1)
+    high = jnp.maximum(jnp.max(signal.values), signal.before)
+    law = innermost(inner)
+    if isinstance(law, Preisach):
+        low, high = law.density.lower_V, law.density.upper_V
+    step = (high - low) / (_LEVELS - 1)
     up = low + step * jnp.asarray(np.arange(_LEVELS), dtype=low.dtype)
     sweep = Signal(jnp.concatenate([up, up[::-1], up]), low, "first")
     branches = inner.run(jnp.asarray(_SLOW_S, dtype=low.dtype), sweep, start).values.reshape(3, _LEVELS)

@@ -1,4 +1,4 @@
-"""Accommodation: minor loops that are not congruent and move (moving Preisach model)."""
+"""Accommodation: minor loops that are not congruent, as those of a moving, or of a curved, Preisach model."""
 
 from typing import Any, ClassVar, Self
 
@@ -7,12 +7,14 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from microid._linear import Times
-from microid._param import param
+from microid._param import array, param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._irreversible import _anhysteretic
 
 _PASSES = 2
+# Degrees of the curve, and what of each is tried first.
+_DEGREES, _SOME = range(2, 6), 0.01
 
 
 @register
@@ -70,3 +72,65 @@ class Accommodation(AbstractEffect):
 
         (values, before), _ = lax.scan(improve, (straight.values, straight.before), None, length=_PASSES + 1)
         return signal.with_values(values, before)
+
+
+@register
+class CurvedHysteresis(AbstractEffect):
+    r"""A curve behind the hysteresis, as in the modified operator of Prandtl and Ishlinskii.
+
+    .. math:: w + \varphi(w) - \varphi(w_{an}(u)), \qquad
+        \varphi(w) = Y \sum_n c_n P_n\left(\frac{w - c}{Y}\right)
+
+    The `P` are Legendre's polynomials. What the curve makes of the voltage alone is left out, as above: it would be
+    one more reversible part.
+
+    Attributes
+    ----------
+    inner
+        The hysteresis `w`.
+    second, third, fourth, fifth
+        `c_2` to `c_5`: what the curve adds at the end of the stroke, over half the stroke.
+    centre_um, half_stroke_um
+        `c` and `Y`, given.
+    """
+
+    name: ClassVar[str] = "accommodation"
+    form: ClassVar[str] = "curve"
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("second", "third", "fourth", "fifth")
+    fingerprint: ClassVar[str] = Accommodation.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = Accommodation.confusions
+    experiment: ClassVar[str] = Accommodation.experiment
+    source: ClassVar[str] = "modified Prandtl-Ishlinskii operator: Kuhnen, European Journal of Control 9 (2003) 407"
+    inner: AbstractPart
+    second: Float[Array, ""] = param(unit="1", scale=0.01)
+    third: Float[Array, ""] = param(unit="1", scale=0.01)
+    fourth: Float[Array, ""] = param(unit="1", scale=0.01)
+    fifth: Float[Array, ""] = param(unit="1", scale=0.01)
+    centre_um: Float[Array, ""] = array()
+    half_stroke_um: Float[Array, ""] = array()
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """One group: each polynomial, about the middle of the stroke."""
+        if inner is None:
+            return ()
+        middle, half = jnp.asarray(scales.middle_um), jnp.asarray(scales.stroke_um / 2)
+        each = _SOME * jnp.eye(len(_DEGREES))
+        return (tuple(cls(inner, a, b, c, d, middle, half) for a, b, c, d in each),)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Bend what the hysteresis gives."""
+        given, straight = self.inner.run(time_s, signal, start), _anhysteretic(self.inner, signal, start)
+        values = given.values + self._curve(given.values) - self._curve(straight.values)
+        return given.with_values(values, given.before + self._curve(given.before) - self._curve(straight.before))
+
+    def _curve(self, displacement_um: Float[Array, "..."]) -> Float[Array, "..."]:
+        place = (displacement_um - self.centre_um) / self.half_stroke_um
+        before, here, found = jnp.ones_like(place), place, jnp.zeros_like(place)
+        for n, part in zip(_DEGREES, (self.second, self.third, self.fourth, self.fifth), strict=True):
+            before, here = here, ((2 * n - 1) * place * here - (n - 1) * before) / n
+            found = found + part * here
+        return self.half_stroke_um * found
