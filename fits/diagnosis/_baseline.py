@@ -104,6 +104,12 @@ class Baseline:
         stage = Stage((driver, hysteresis), ("driver", name), hold=self.stage.hold).freeze("driver.gain")
         return Problem.of(stage, self.chain.grid, self.columns_um, self.hyper, self.stroke_um)
 
+    def held_aside(self, hold: Hold) -> "Baseline":
+        """The same, the commands of all runs held out whole going between samples in this way."""
+        each = self.aside, self.coarse_aside, self.finest_aside, self.fine_aside
+        aside, coarse, finest, fine = (tuple(replace(run, hold=hold) for run in runs) for runs in each)
+        return replace(self, aside=aside, coarse_aside=coarse, finest_aside=finest, fine_aside=fine)
+
     def alone(self, run: Run) -> "Baseline":
         """The same with one run only; what is known of the columns beforehand counts with the others."""
         made, none = (run,), ()

@@ -23,7 +23,7 @@ from fits.diagnosis._extension import (
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._misfit import SHOWN, worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
-from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared
+from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared, of_holds_aside
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._residual_tests import explain, further_regressors, irregular, run_regressors
 from fits.diagnosis._result import Diagnosis, FoundCause, Gain, RunView, Step, Test, Verdict
@@ -109,6 +109,7 @@ def conclude(
         how = "the stage is left plain" if plain else "the extended stage is without"
         if own:
             remarks.append(f"{own}: not the same in the runs held out, so that {how}")
+    remarks += of_holds_aside(baseline.stage.hold, [one.run for one in extension.compared[len(baseline.runs) :]])
     # Up to its own size rounding makes structure, too.
     left_over = left_over and not (rounded and rest_noise * unit_um < rounding_um)
     cyclic = (
@@ -189,7 +190,8 @@ def conclude(
         left_over, rest_noise = True, max(rest_noise, faults.band.size_um / unit_um)
     if bursts or rings:
         left_over = True
-        excess = told.plain.cost / max(told.first.count - told.first.freedom, 1.0) - 1
+        left = told.model if kept else told.plain
+        excess = left.cost / max(told.first.count - told.first.freedom, 1.0) - 1
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
     unexplained_um = rest_noise * unit_um if left_over else 0.0
     moving = [cause for cause in causes if not card_of(cause.name).statistic]

@@ -139,14 +139,32 @@ def _compare(
             Compared(run, left_of(run, nuisance, plain, using), left_of(run, nuisance, better, using), run.held_out)
         )
     if ready.baseline.aside:
-        behind = Bench(bench.baseline, aside=True, finest=finest)
-        for k, run in enumerate(ready.baseline.fine_aside):
-            plain = simulate(ready.baseline.stage, run)
-            columns = nuisance_columns(ready.baseline.stage, run.samples)
-            nuisance, using = np.asarray(columns)[: len(run.record)], run.known
-            better_um = _with_past(behind, k, effects, run, simulate(bench.baseline.stage, run), nuisance)
-            found.append(Compared(run, left_of(run, nuisance, plain, using), better_um, using))
+        asides = _aside(ready.baseline, bench.baseline, effects, finest)
+        usual = bench.baseline.stage.hold
+        if effects and any(run.hold != usual for run in ready.baseline.aside):
+            # What the plain stage lacks may have looked like a command that goes otherwise between samples.
+            others = _aside(ready.baseline.held_aside(usual), bench.baseline.held_aside(usual), effects, finest)
+            asides = [
+                min(pair, key=lambda one: _square(one.after_um[one.held_out]))
+                for pair in zip(asides, others, strict=True)
+            ]
+        found += asides
     return tuple(found)
+
+
+def _aside(plain: Baseline, baseline: Baseline, effects: Sequence[AbstractEffect], finest: bool) -> list[Compared]:
+    """Residuals of the plain stage, and of another baseline with effects, in the runs held out whole."""
+    behind, found = Bench(baseline, aside=True, finest=finest), []
+    for k, run in enumerate(plain.fine_aside):
+        nuisance, using = np.asarray(nuisance_columns(plain.stage, run.samples))[: len(run.record)], run.known
+        before_um = left_of(run, nuisance, simulate(plain.stage, run), using)
+        after_um = _with_past(behind, k, effects, run, simulate(baseline.stage, run), nuisance)
+        found.append(Compared(run, before_um, after_um, using))
+    return found
+
+
+def _square(values: np.ndarray) -> float:
+    return float(values @ values)
 
 
 def _with_past(
@@ -174,7 +192,7 @@ def _with_past(
         return left_of(run, nuisance, plain_um + change_um, run.known)
 
     def missed(values: np.ndarray) -> float:
-        return float(np.sum(left(values)[run.known] ** 2))
+        return _square(left(values)[run.known])
 
     best = np.array([0.0] * len(own) + [float(getattr(effects[at], name)) for at, name in begins])
     for place, (at, _) in enumerate(begins, len(own)):

@@ -17,6 +17,7 @@ from fits.diagnosis._result import Step
 from fits.diagnosis._score import Probe
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
+from fits.loop._run import Run
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem
 from fits.stats._held import held_gain
@@ -237,13 +238,18 @@ def _hold_of_plateaus(record: Record) -> Hold:
 
 def _of_holds(baseline: Baseline) -> list[str]:
     """Say how commands are taken to go between samples, where not all of them run in lines."""
-    said, usual = [], baseline.stage.hold
+    said = []
     each = {run.hold for run in baseline.runs}
     for hold in sorted(each) if each != {"first"} else []:
         of = "" if len(each) == 1 else " of " + ", ".join(r.record.source for r in baseline.runs if r.hold == hold)
         said.append(_WORDS[hold][0].format(of))
-    others = [run for run in baseline.aside if run.hold != usual]
-    return said + [_ASIDE.format(run.record.source, _WORDS[run.hold][1]) for run in others]
+    return said
+
+
+def of_holds_aside(usual: Hold, runs: Sequence[Run]) -> list[str]:
+    """Say of which runs held out whole the command is taken to go otherwise between samples than usual."""
+    others = [run for run in runs if run.hold != usual]
+    return [_ASIDE.format(run.record.source, _WORDS[run.hold][1]) for run in others]
 
 
 def _covered(records: Sequence[Record], fraction: float) -> bool:
