@@ -3,7 +3,6 @@
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -19,8 +18,8 @@ _SUBSTEPS, _PAST_SUBSTEPS = 2, 32
 _SMALL = 1e-12
 # Gain and loss vary by so much at most, and are no less than this.
 _VARIED, _LEAST = 2.0, 0.02
-# Places in the range at which the farthest limit of the state is looked for.
-_PLACES = np.linspace(-1, 1, 17)
+# So many places in the range at which the farthest limit of the state is looked for.
+_PLACES = 17
 
 
 @register
@@ -124,7 +123,7 @@ class BoucWenHysteresis(AbstractEffect):
 
     def _limit(self, way: float) -> Float[Array, ""]:
         """The farthest that the state approaches as the voltage goes up or down."""
-        gain, loss = self._varied(jnp.asarray(_PLACES))
+        gain, loss = self._varied(jnp.linspace(-1, 1, _PLACES))
         most = jnp.log(jnp.max(gain / loss))
         return way * jnp.exp((most - jnp.log1p(2 * way * self.asymmetry)) / self.exponent)
 
