@@ -41,6 +41,31 @@ def test_what_forgets_reversals_by_and_by_is_named_and_its_law_found(rng):
     assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
 
 
+@pytest.mark.study
+def test_a_law_whose_curve_is_no_line_is_found_and_a_drift_behind_it(rng):
+    """Coleman and Hodgdon's: the drift had to leave nothing but noise before the law was fitted beside it."""
+    way_V = np.r_[0, np.cumsum(np.abs(np.diff(TURNS_V)))]
+    voltage_V = np.interp(np.arange(0, way_V[-1], 60 / RATE_Hz), way_V, TURNS_V)
+    length_V, tilt, drift_um = rng.uniform(20, 35), rng.choice([-1, 1]) * rng.uniform(0.25, 0.5), 0.12
+    fine_V = np.interp(np.arange((len(voltage_V) - 1) * PARTS + 1) / PARTS, np.arange(len(voltage_V)), voltage_V)
+    z, states = tilt - 1, []
+    for here, move in zip(fine_V, np.r_[0.0, np.diff(fine_V)], strict=True):
+        z += (move * (1 + tilt * (here / 50 - 1)) - abs(move) * z) / length_V
+        states.append(z)
+    time_s = np.arange(len(voltage_V)) / RATE_Hz
+    constant_s = rng.uniform(0.2, 0.4) * time_s[-1]
+    truth_um = 0.2 * voltage_V - 1.5 * np.array(states[::PARTS]) + drift_um * -np.expm1(-time_s / constant_s)
+    read_um = truth_um + NOISE_um * rng.standard_normal(len(truth_um))
+    found = diagnose([Record(time_s, voltage_V, read_um, source="loops.csv")])
+    print(length_V, tilt, constant_s, found.summary())
+    law, other = sorted(found.causes, key=lambda one: one.name != "bouc_wen_hysteresis")
+    assert {"thermal_drift"} & {other.name, *other.also_consistent}
+    value = {one.name: one.value for one in law.parameters}
+    assert value["length_share"] == pytest.approx(length_V / 100, rel=0.1)
+    assert value["gain_tilt"] == pytest.approx(tilt, abs=0.1)
+    assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
+
+
 def test_a_resonance_shows_beside_small_loops_of_another_gain(rng):
     """Such runs were said to hold no dynamics: a gain alone left as little of the fast one as the poles did."""
     law = rng.uniform(20, 30), 0.8, 1.0, 0.0

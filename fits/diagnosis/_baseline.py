@@ -141,12 +141,13 @@ def fit_baseline(
     holds: Sequence[Hold] = (),
     better: float = np.inf,
     onward: Problem | None = None,
+    left_out: tuple[str, ...] = (),
 ) -> Baseline:
     """Fit the plain stage: with driver and mechanics where the runs show them, quasi-static otherwise.
 
     `holds` say how the commands of `records` run between samples, as in `Stage`, in lines by default. Those of
     `aside` run as the fastest of these, unless that part of their error goes otherwise. The fit goes `onward` from
-    one that was made.
+    one that was made. Where it is known why the runs show none, that is said, and they are `left_out`.
 
     Raises
     ------
@@ -164,6 +165,8 @@ def fit_baseline(
     hold = holds[int(np.argmax([np.mean(rate**2) for rate in rates]))]
     past = pasts_to_estimate(records, range_V, holdout)
     past_aside = (any(past),) * len(aside)
+    if left_out:
+        return _static(records, aside, range_V, holdout, initial, past, left_out, progress)
     try:
         near = None if onward is None else onward.held(hold)
         stage = default_stage(hold) if near is None else near.stage

@@ -128,7 +128,9 @@ def prepare_diagnosis(
         if not faults.repaired:
             return PlainFit(regression, faults, reading.thresholds)
         progress("fitting the plain stage again, without single bad samples")
-        regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem))
+        # Where an effect passes for bad samples, what runs show no poles of they show none of without these.
+        left_out = () if regression.baseline.dynamic else regression.baseline.remarks
+        regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem, left_out))
         found = find_faults(regression, None, reading.thresholds)
         found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
         return PlainFit(regression, found, reading.thresholds)
