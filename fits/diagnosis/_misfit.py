@@ -131,7 +131,9 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
         )
         return -1 / max(explained, 1e-300), name, why
     part = replace(misfit, explained=explained).share
-    if card.independent or part >= thresholds.minor_share:
+    # What comes as often as it may follows a part of anything.
+    least = thresholds.explained_share if misfit.is_left_over and card.repeats else thresholds.minor_share
+    if card.independent or part >= least:
         return None
     share = f"{100 * part:.0f} %" if part > SHOWN else "hardly any"
     return (

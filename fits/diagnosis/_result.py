@@ -12,6 +12,7 @@ import numpy as np
 
 from fits.io._length import length
 from fits.io._limits import Extreme
+from fits.io._percent import percent
 from fits.io._summary import AbstractSummary
 from fits.loop._line_words import amplitude
 from fits.loop._report_words import unseen
@@ -255,7 +256,7 @@ class Diagnosis(AbstractSummary):
             lines.append(f"  {cause.name}{also}: {cause.z:.3g} standard deviations, by chance {chance}")
             whole = "noise" if card_of(cause.name).statistic else "misfit"
             if math.isfinite(cause.rms_um) and math.isfinite(cause.share_of_misfit):
-                lines.append(f"    {length(cause.rms_um)}, {100 * cause.share_of_misfit:.0f} % of the {whole}")
+                lines.append(f"    {length(cause.rms_um)}, {percent(cause.share_of_misfit)} of the {whole}")
             for each in cause.shown:
                 if words := unseen(each.value, each.lower, each.upper):
                     lines.append(f"    {each.name:24} {words}")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fits.diagnosis._result import SMALLEST_P, Diagnosis, FoundCause, RunView
-from fits.io import _length
+from fits.io import _length, _percent
 from fits.loop._report_words import unseen
 from fits.loop._result import ParameterEstimate
 from microid.effects import EFFECTS, card_of
@@ -94,11 +94,7 @@ def parameter_name(parameter: ParameterEstimate) -> str:
 
 def percent(share: float) -> str:
     """Write a fraction as a percentage that is never rounded to all or nothing."""
-    if 0 < share < 0.01:
-        return "< 1 %"
-    if 0.99 < share < 1:
-        return "> 99 %"
-    return f"{100 * share:.0f} %".replace("-", _MINUS) if math.isfinite(share) else NONE
+    return _percent.percent(share).replace("-", _MINUS) if math.isfinite(share) else NONE
 
 
 def chance(p: float) -> str:
