@@ -7,7 +7,8 @@ from test_diagnosis_foreign import SLOW_V, plays
 from fits import Record, diagnose
 from fits.diagnosis._occurrences import has_occurred, is_abrupt
 from fits.diagnosis._prepare import Reading, prepare_diagnosis
-from fits.diagnosis._refit import nothing, refit_beside, relocate
+from fits.diagnosis._refit import nothing, refit_beside
+from fits.diagnosis._relocate import relocate
 from fits.diagnosis._score import score
 from fits.diagnosis._thresholds import THRESHOLDS
 

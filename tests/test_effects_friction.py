@@ -49,21 +49,25 @@ def test_a_state_of_bouc_and_wen_stays_behind_the_voltage(rng, sigma, exponent, 
     np.testing.assert_allclose(through(effect, 1e-3, voltage), given - amplitude * states, atol=1e-4 * amplitude)
 
 
-@pytest.mark.parametrize(("gain", "loss"), [((0.4, -0.2), (0.0, 0.0)), ((-0.3, 0.25), (0.3, -0.15))])
+@pytest.mark.parametrize(
+    ("gain", "loss"), [((0.4, -0.2, 0.1, -0.3), (0.0, 0.0)), ((-0.3, 0.25, 0.0, 0.1), (0.3, -0.15))]
+)
 def test_its_gain_and_loss_vary_with_the_voltage(rng, gain, loss):
-    hysteresis, voltage = random_model(rng, 8), wander(rng, 300, 10, 90)
+    hysteresis, voltage = random_model(rng, 8), wander(rng, 300, 10, 58)
     lower, amplitude, length = float(hysteresis.density.lower_V), 2.0, 20.0
     span = float(hysteresis.density.upper_V) - lower
     effect = BY_NAME["bouc_wen_hysteresis", ""](
         *(hysteresis, amplitude, length / span, 0.8, 1.4, span, 0.0, 0.0), *gain, *loss, lower
     )
 
+    def varied(place):
+        return [np.exp(np.polynomial.legendre.legval(place, [0, *some])) for some in (gain, loss)]
+
     def slope(volt, z, way):
-        one, two = (np.polynomial.legendre.legval(2 * (volt - lower) / span - 1, [1, *some]) for some in (gain, loss))
+        one, two = varied(2 * (volt - lower) / span - 1)
         return (one - two * abs(z) ** 1.4 * (0.2 + 0.8 * np.sign(z) * way)) / length
 
-    places = np.linspace(-1, 1, 1001)
-    first = [np.polynomial.legendre.legval(places, [1, *some]) for some in (gain, loss)]
+    first = varied(np.linspace(-1, 1, 1001))
     states = followed([lower, *voltage], -(np.max(first[0] / first[1]) ** (1 / 1.4)), slope)
     given = through(hysteresis, 1e-3, voltage)
     np.testing.assert_allclose(through(effect, 1e-3, voltage), given - amplitude * states, atol=1e-3 * amplitude)

@@ -10,7 +10,8 @@ from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State, fit_from_poles, fit_jointly
 from fits.diagnosis._occurrences import add_occurrences, has_occurred, is_abrupt
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit_beside, relocate
+from fits.diagnosis._refit import Refit, refit_beside
+from fits.diagnosis._relocate import relocate
 from fits.diagnosis._score import Probe, Scored, best_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._threads import map_in_threads

@@ -12,8 +12,9 @@ from fits.diagnosis._discrepancy import learn_roughness, smoothed, with_discrepa
 from fits.diagnosis._effects import Bench, Law, scaled
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit, relocate
+from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._regression import regress, saturating
+from fits.diagnosis._relocate import relocate
 from fits.diagnosis._thresholds import Thresholds
 from fits.io._threads import map_in_threads
 from fits.stage._run import named_parts

@@ -9,7 +9,8 @@ import numpy as np
 
 from fits.diagnosis._effects import Bench, Law
 from fits.diagnosis._projector import Projector
-from fits.diagnosis._refit import Refit, refit, refit_beside, relocate
+from fits.diagnosis._refit import Refit, refit, refit_beside
+from fits.diagnosis._relocate import relocate
 from fits.diagnosis._score import Scored, score
 from fits.diagnosis._thresholds import Thresholds
 

@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
@@ -29,8 +27,6 @@ _LAST = 3
 _ROUNDING_SHARE, _UNKNOWN_VARIANCE = 1e-4, 1e6
 # Multiple of its range in the runs by which a rig may have moved at most before one, and the least of a room's.
 _FARTHER, _ROOM_K = 2.0, 0.5
-# Part of the shortest record by which another instant is tried at first, and the gain in chi-square that pays.
-_FIRST_SHIFT, _PAYS = 0.05, 1.0
 # Displacements beyond this are those of a model that runs away, and multiples of the linearised answer as starts.
 _AWAY_um, _MULTIPLES = 1e9, (1.0, 3.0, 9.0)
 
@@ -178,7 +174,7 @@ def refit(
     bench: Bench, projector: Projector, laws: Sequence[Law], x: Sequence[np.ndarray], rounds: int = _ROUNDS
 ) -> Refit:
     """Fit effects together by Levenberg and Marquardt's steps, the baseline projected out (variable projection)."""
-    return _fit(bench, projector, laws, x, 0, np.zeros((len(projector.residual), 0)), rounds)
+    return fit_laws(bench, projector, laws, x, 0, np.zeros((len(projector.residual), 0)), rounds)
 
 
 def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Scored, enough: float = np.inf) -> Refit:
@@ -192,40 +188,16 @@ def refit_beside(bench: Bench, projector: Projector, model: Refit, scored: Score
 
     def fit(law: Law, rounds: int) -> Refit:
         laws, x = [*model.laws, law], [*model.x, law.start]
-        return _fit(bench, projector, laws, x, len(model.laws), basis, rounds, enough)
+        return fit_laws(bench, projector, laws, x, len(model.laws), basis, rounds, enough)
 
     laws = [law_of(scored, runs, more) for more in (_MULTIPLES if scored.form.strength else (1.0,))]
     found = fit(min(laws, key=lambda law: fit(law, 0).cost), _ROUNDS)
-    if not found.laws[-1].form.history:
+    if not scored.form.history:
         return found
     # What went on before the runs is unknown where that explains more than so many coordinates do by chance.
     unknown = fit(remembering(bench, found.laws[-1], found.x[-1]), _ROUNDS)
     better = unknown.criterion(projector.count) < found.criterion(projector.count)
     return unknown if better and unknown.possible(bench) else found
-
-
-def relocate(bench: Bench, projector: Projector, model: Refit, first: int = 0) -> Refit:
-    """Search for better instants of what happened at one, beyond a fit's steps, in laws from the `first` on.
-
-    The sum of squares over the instant is jagged where the stage rings, and a rise that is too long keeps to itself:
-    better ones are tried on both sides, nearer and nearer, and in the middle of a rise.
-    """
-    at = [k for k in range(first, len(model.laws)) if hasattr(model.laws[k].effect(model.x[k], 0), "after_s")]
-    if not at:
-        return model
-    # So far some may only have been followed along their tangent, or beside another baseline.
-    model = refit(bench, projector, model.laws, model.x, 2)
-    step_s = _FIRST_SHIFT * min(one.run.record.duration_s for one in bench.prepared)
-    least_s = min(float(np.median(np.diff(one.run.record.time_s))) for one in bench.prepared)
-    while step_s > least_s:
-        ways = [(k, way) for k in at for way in (-step_s, *[0.0] * bool(model.laws[k].form.rise), step_s)]
-        tried = [_moved(bench, projector, model, k, way, least_s) for k, way in ways]
-        best = min(tried, key=lambda one: one.cost)
-        better = refit(bench, projector, best.laws, best.x, 2) if best.cost < model.cost else model
-        # Where other coordinates still creep, any step would seem to pay.
-        step_s = step_s if better.cost < model.cost - _PAYS else step_s / 2
-        model = min(better, model, key=lambda one: one.cost)
-    return model
 
 
 def refit_around(bench: Bench, projector: Projector, model: Refit, which: int, law: Law, rounds: int) -> Refit:
@@ -235,7 +207,7 @@ def refit_around(bench: Bench, projector: Projector, model: Refit, which: int, l
         return refit(bench, projector, laws, x, 0)
     order = [which, *(k for k in range(len(laws)) if k != which)]
     nothing = np.zeros((len(projector.residual), 0))
-    found = _fit(bench, projector, [laws[k] for k in order], [x[k] for k in order], 1, nothing, rounds)
+    found = fit_laws(bench, projector, [laws[k] for k in order], [x[k] for k in order], 1, nothing, rounds)
     return in_order(found, order)
 
 
@@ -245,24 +217,7 @@ def in_order(found: Refit, order: Sequence[int]) -> Refit:
     return replace(found, laws=tuple(found.laws[k] for k in back), x=tuple(found.x[k] for k in back))
 
 
-def _moved(bench: Bench, projector: Projector, model: Refit, k: int, way_s: float, least_s: float) -> Refit:
-    """Fit a law at another instant, and at once from there; all others stay, and follow along their tangent."""
-    here: list[Any] = [model.laws[k].effect(model.x[k], run) for run in range(len(bench.prepared))]
-    if rise := model.laws[k].form.rise:
-        at_once, half_s = {rise: jnp.asarray(least_s)}, [float(getattr(one, rise) - least_s) / 2 for one in here]
-        here = [replace(one, after_s=one.after_s + more, **at_once) for one, more in zip(here, half_s, strict=True)]
-    later = [replace(one, after_s=jnp.maximum(one.after_s + way_s, least_s)) for one in here]
-    laws, x = model.with_law(k, Law(later, model.laws[k].remembers))
-    order = [*(i for i in range(len(laws)) if i != k), k]
-    owner = np.repeat(np.arange(len(laws)), [law.size for law in model.laws])
-    basis = replace(model, tangent=model.tangent[:, owner != k]).basis()
-    ordered = [laws[i] for i in order], [x[i] for i in order]
-    # What is no better after the first round is not followed.
-    found = _fit(bench, projector, *ordered, len(laws) - 1, basis, 2, model.cost)
-    return in_order(found, order)
-
-
-def _fit(
+def fit_laws(
     bench: Bench,
     projector: Projector,
     laws: Sequence[Law],

@@ -16,10 +16,10 @@ from microid.effects._grids import _decades
 # Steps of the classical Runge-Kutta rule per sample, and per move before the record.
 _SUBSTEPS, _PAST_SUBSTEPS = 2, 32
 _SMALL = 1e-12
-# Gain and loss vary by so much at most, and are no less than this.
-_VARIED, _LEAST = 2.0, 0.02
+# Each polynomial is at most so much of the logarithm of gain or loss.
+_VARIED = 3.0
 # So many places in the range at which the farthest limit of the state is looked for.
-_PLACES = 17
+_PLACES = 129
 
 
 @register
@@ -31,11 +31,11 @@ class BoucWenHysteresis(AbstractEffect):
         + \phi\, (\mathrm{sgn}\, \dot u + \mathrm{sgn}\, z)\right)
 
     It forgets reversals by and by, where a Preisach operator wipes them out or keeps them: its minor loops do not
-    close, and those between the same voltages differ. Gain and loss, `g` and `p`, are parabolas with a mean of one
-    over the range, :math:`1 + a x + b (3 x^2 - 1) / 2` for `x` from -1 to 1. With `sigma` and `n` of one it is Dahl's
-    law, and with a gain that varies that of Coleman and Hodgdon, whose curves are not straight. Before the record the
-    voltage went along what the memory of a `Preisach` holds, from where it had come down for long; ahead of another
-    law it had just done so.
+    close, and those between the same voltages differ. The logarithms of gain and loss, `g` and `p`, are sums of
+    Legendre's polynomials over the range of the voltage. With `sigma` and `n` of one it is Dahl's law, and with a
+    gain that varies that of Coleman and Hodgdon, whose curves are not straight; with a `sigma` of a half it is that
+    of Jiles and Atherton without coupling. Before the record the voltage went along what the memory of a `Preisach`
+    holds, from where it had come down for long; ahead of another law it had just done so.
 
     Attributes
     ----------
@@ -56,10 +56,10 @@ class BoucWenHysteresis(AbstractEffect):
         `phi`, by which rising branches bend more than falling ones.
     before
         What `z` was before the first sample, beyond what the memory tells.
-    gain_tilt, gain_bend
-        `a` and `b` of the gain: the part is wider where that is larger.
-    loss_tilt, loss_bend
-        Those of the loss: the part turns sooner where that is larger.
+    gain_first, gain_second, gain_third, gain_fourth
+        Of the polynomials in the logarithm of the gain: the part is wider where that is larger.
+    loss_first, loss_second
+        Of those in that of the loss: the part turns sooner where that is larger.
     lower_V
         Where the range begins, given.
     """
@@ -92,10 +92,12 @@ class BoucWenHysteresis(AbstractEffect):
     range_V: Float[Array, ""] = array()
     asymmetry: Float[Array, ""] = param(unit="1", scale=0.1, lower=-0.45, upper=0.45, default=0.0)
     before: Float[Array, ""] = param(unit="1", lower=-2.0, upper=2.0, default=0.0)
-    gain_tilt: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
-    gain_bend: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
-    loss_tilt: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
-    loss_bend: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    gain_first: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    gain_second: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    gain_third: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    gain_fourth: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    loss_first: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
+    loss_second: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
     lower_V: Float[Array, ""] = array(default=0.0)
 
     @classmethod
@@ -129,40 +131,44 @@ class BoucWenHysteresis(AbstractEffect):
 
     def _varied(self, place: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Gain and loss at places in the range, from -1 to 1."""
-        bent = (3 * place**2 - 1) / 2
-        gain = 1 + self.gain_tilt * place + self.gain_bend * bent
-        loss = 1 + self.loss_tilt * place + self.loss_bend * bent
-        return jnp.maximum(gain, _LEAST), jnp.maximum(loss, _LEAST)
+        second, third = (3 * place**2 - 1) / 2, (5 * place**3 - 3 * place) / 2
+        fourth = (35 * place**4 - 30 * place**2 + 3) / 8
+        gain = self.gain_first * place + self.gain_second * second
+        gain += self.gain_third * third + self.gain_fourth * fourth
+        return jnp.exp(gain), jnp.exp(self.loss_first * place + self.loss_second * second)
 
     def _along(self, state: Float[Array, ""], voltage_V: Float[Array, " t"], substeps: int) -> Float[Array, " t-1"]:
         """The state at all voltages but the first, at which it is given."""
         lowest, highest = self._limit(-1.0), self._limit(1.0)
         places = jnp.clip(2 * (voltage_V - self.lower_V) / self.range_V - 1, -1, 1)
+        # At the ends and in the middle of each step, all at once: in the loop they would take most of the time.
+        whole = jnp.linspace(0, 1, 2 * substeps + 1, dtype=places.dtype)
+        shares = jnp.stack([whole[:-2:2], whole[1::2], whole[2::2]], axis=1)
+        first, way = places[:-1, None, None], jnp.diff(places)[:, None, None]
+        gain, loss = self._varied(first + way * shares[None])
 
-        def slope(z: Array, way: Array, place: Array) -> Array:
+        def slope(z: Array, way: Array, gain: Array, loss: Array) -> Array:
             # Within the limits it never goes back, however long a step is.
             z = jnp.clip(z, lowest, highest)
             size, side = jnp.abs(z), jnp.sign(z)
             # The logarithm has no derivative at zero, where the power has.
             at_zero = size < _SMALL
             power = jnp.where(at_zero, 0.0, jnp.exp(self.exponent * jnp.log(jnp.where(at_zero, 1.0, size))))
-            gain, loss = self._varied(place)
             return gain - loss * power * (1 - self.sigma + self.sigma * side * way + self.asymmetry * (way + side))
 
         def visit(z: Array, move: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            move_V, first, last = move
+            move_V, *varied = move
             step, way = move_V / (self.length_share * self.range_V * substeps), jnp.sign(move_V)
-            on = (last - first) / substeps
 
-            def go(number: int, z: Array) -> Array:
-                place = first + number * on
-                k1 = slope(z, way, place)
-                k2 = slope(z + step * k1 / 2, way, place + on / 2)
-                k3 = slope(z + step * k2 / 2, way, place + on / 2)
-                k4 = slope(z + step * k3, way, place + on)
-                return jnp.clip(z + step * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest)
+            def go(z: Array, here: list[Array]) -> tuple[Array, None]:
+                gain, loss = here
+                k1 = slope(z, way, gain[0], loss[0])
+                k2 = slope(z + step * k1 / 2, way, gain[1], loss[1])
+                k3 = slope(z + step * k2 / 2, way, gain[1], loss[1])
+                k4 = slope(z + step * k3, way, gain[2], loss[2])
+                return jnp.clip(z + step * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest), None
 
-            z = lax.fori_loop(0, substeps, go, z)
+            z, _ = lax.scan(go, z, varied, unroll=min(substeps, _SUBSTEPS))
             return z, z
 
-        return lax.scan(visit, state, (jnp.diff(voltage_V), places[:-1], places[1:]))[1]
+        return lax.scan(visit, state, (jnp.diff(voltage_V), gain, loss))[1]
