@@ -12,6 +12,7 @@ from test_model_file import REPORT, bits, hashed, refusal
 import microid
 from fits import DataError, Record, StageUncertainty, Uncertainty, load_model, predict, save_model
 from fits.loop._design import Grid
+from microid.effects.bouc_wen_hysteresis import BoucWenHysteresis
 
 PARAMETERS, LEVELS, PERTURBATIONS = 3, 5, 6
 
@@ -190,3 +191,20 @@ def test_a_stage_that_turns_the_sign_ahead_of_its_hysteresis_is_refused_with_its
     refused(run("simulate", path, program, "--out", out), f"{path}: the static gain ahead of", "is -1")
     refused(run("compensate", path, reference, "--out", out), f"{path}: part ", "a positive static gain, found -1")
     assert not out.exists()
+
+
+def test_an_effect_of_an_older_file_has_what_came_later_at_rest(tmp_path, rng):
+    path = tmp_path / "model.json"
+    law = BoucWenHysteresis(random_model(rng, 6), 2.0, 0.25, 0.8, 1.4, 100.0, gain_first=0.3)
+    save_model(path, microid.Stage.of(hysteresis=law), None, {})
+    content = json.loads(path.read_text())
+    (part,) = content["model"]["parts"]
+    for name in ("gain_first", "gain_second", "gain_third", "gain_fourth", "loss_first", "loss_second", "lower_V"):
+        del part[name]
+    path.write_text(json.dumps(hashed(content)))
+    effect = load_model(path).model.parts[0]
+    assert float(effect.gain_first) == 0.0
+    assert float(effect.sigma) == 0.8
+    del part["sigma"]
+    path.write_text(json.dumps(hashed(content)))
+    assert "has the fields" in refusal(path)

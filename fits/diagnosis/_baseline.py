@@ -147,7 +147,7 @@ def fit_baseline(
 
     `holds` say how the commands of `records` run between samples, as in `Stage`, in lines by default. Those of
     `aside` run as the fastest of these, unless that part of their error goes otherwise. The fit goes `onward` from
-    one that was made. Where it is known why the runs show none, that is said, and they are `left_out`.
+    one that was made. `left_out` says why driver and mechanics are left out, where that is known already.
 
     Raises
     ------

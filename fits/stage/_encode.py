@@ -106,13 +106,16 @@ def _decode_module(item: dict[str, Any], where: str) -> eqx.Module:
     if cls is None:
         raise DataError(f"{where}: {shown(item['type'])} is not the name of a model that this version knows")
     fields = _fields(cls)
-    if set(item) - {"type"} != set(fields):
+    given = set(item) - {"type"}
+    # What came to a model later has a default, which older files mean.
+    needed = {key for key, field in fields.items() if field.default is dataclasses.MISSING}
+    if not needed <= given <= set(fields):
         raise DataError(f"{where}: a {item['type']} has the fields {', '.join(fields)}, and no others")
-    values = {key: decode(item[key], f"{where}.{key}", spec_of(field)) for key, field in fields.items()}
+    values = {key: decode(item[key], f"{where}.{key}", spec_of(fields[key])) for key in fields if key in given}
     # One context, so that an `N` means the same in all fields.
     with jaxtyping.jaxtyped("context"):
-        for key, field in fields.items():
-            _check(values[key], item[key], field.type, f"{where}.{key}")
+        for key, value in values.items():
+            _check(value, item[key], fields[key].type, f"{where}.{key}")
     limits = [np.asarray(values[key]) for key in ("lower_V", "upper_V") if key in values]  # compared without JAX
     if len(limits) == 2 and not np.all(limits[0] < limits[1]):
         raise DataError(f"{where}: expected lower_V below upper_V")
