@@ -76,8 +76,13 @@ def test_beside_what_is_left_a_cause_is_named_only_where_it_predicts(monkeypatch
     assert named_beside(monkeypatch, parts, chance + 2500.0, helpful=["creep"]) == ["creep"]
     assert named_beside(monkeypatch, parts, chance + 2500.0, helpful=[*parts]) == [*parts]
     # What one run had of its own is seen in no other.
-    jump = {"creep": 8000.0, "zero_shift": 4000.0}
-    assert named_beside(monkeypatch, jump, chance + 2500.0, helpful=["creep"]) == [*jump]
+    load = {"creep": 8000.0, "load_change": 4000.0}
+    assert named_beside(monkeypatch, load, chance + 2500.0, helpful=["creep"]) == [*load]
+    # What may come as often as it likes follows a part of anything: it must be most of what the others leave.
+    for jumps, named in ((4000.0, ["creep"]), (6000.0, ["creep", "zero_shift"])):
+        parts = {"creep": 8000.0, "zero_shift": jumps}
+        assert named_beside(monkeypatch, parts, chance + 2500.0, helpful=["creep"]) == named
+    assert named_beside(monkeypatch, {"creep": 8000.0, "zero_shift": 4000.0}, chance) == ["creep", "zero_shift"]
 
 
 def test_what_predicts_worse_is_not_named_beside_others(monkeypatch):
