@@ -88,7 +88,7 @@ class CurvedHysteresis(AbstractEffect):
     ----------
     inner
         The hysteresis `w`.
-    second, third, fourth, fifth
+    curve_second, curve_third, curve_fourth, curve_fifth
         `c_2` to `c_5`: what the curve adds at the end of the stroke, over half the stroke.
     centre_um, half_stroke_um
         `c` and `Y`, given.
@@ -99,16 +99,16 @@ class CurvedHysteresis(AbstractEffect):
     takes: ClassVar[str] = "V"
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
-    strength: ClassVar[tuple[str, ...]] = ("second", "third", "fourth", "fifth")
+    strength: ClassVar[tuple[str, ...]] = ("curve_second", "curve_third", "curve_fourth", "curve_fifth")
     fingerprint: ClassVar[str] = Accommodation.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Accommodation.confusions
     experiment: ClassVar[str] = Accommodation.experiment
     source: ClassVar[str] = "modified Prandtl-Ishlinskii operator: Kuhnen, European Journal of Control 9 (2003) 407"
     inner: AbstractPart
-    second: Float[Array, ""] = param(unit="1", scale=0.01)
-    third: Float[Array, ""] = param(unit="1", scale=0.01)
-    fourth: Float[Array, ""] = param(unit="1", scale=0.01)
-    fifth: Float[Array, ""] = param(unit="1", scale=0.01)
+    curve_second: Float[Array, ""] = param(unit="1", scale=0.01)
+    curve_third: Float[Array, ""] = param(unit="1", scale=0.01)
+    curve_fourth: Float[Array, ""] = param(unit="1", scale=0.01)
+    curve_fifth: Float[Array, ""] = param(unit="1", scale=0.01)
     centre_um: Float[Array, ""] = array()
     half_stroke_um: Float[Array, ""] = array()
 
@@ -130,7 +130,9 @@ class CurvedHysteresis(AbstractEffect):
     def _curve(self, displacement_um: Float[Array, "..."]) -> Float[Array, "..."]:
         place = (displacement_um - self.centre_um) / self.half_stroke_um
         before, here, found = jnp.ones_like(place), place, jnp.zeros_like(place)
-        for n, part in zip(_DEGREES, (self.second, self.third, self.fourth, self.fifth), strict=True):
+        for n, part in zip(
+            _DEGREES, (self.curve_second, self.curve_third, self.curve_fourth, self.curve_fifth), strict=True
+        ):
             before, here = here, ((2 * n - 1) * place * here - (n - 1) * before) / n
             found = found + part * here
         return self.half_stroke_um * found
