@@ -11,10 +11,11 @@ from microid._param import array, param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._irreversible import _anhysteretic
+from microid.effects._legendre import _legendre
 
 _PASSES = 2
-# Degrees of the curve, and what of each is tried first.
-_DEGREES, _SOME = range(2, 6), 0.01
+# What of each degree of a curve is tried first.
+_SOME = 0.01
 
 
 @register
@@ -118,7 +119,7 @@ class CurvedHysteresis(AbstractEffect):
         if inner is None:
             return ()
         middle, half = jnp.asarray(scales.middle_um), jnp.asarray(scales.stroke_um / 2)
-        each = _SOME * jnp.eye(len(_DEGREES))
+        each = _SOME * jnp.eye(len(cls.strength))
         return (tuple(cls(inner, a, b, c, d, middle, half) for a, b, c, d in each),)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
@@ -129,10 +130,5 @@ class CurvedHysteresis(AbstractEffect):
 
     def _curve(self, displacement_um: Float[Array, "..."]) -> Float[Array, "..."]:
         place = (displacement_um - self.centre_um) / self.half_stroke_um
-        before, here, found = jnp.ones_like(place), place, jnp.zeros_like(place)
-        for n, part in zip(
-            _DEGREES, (self.curve_second, self.curve_third, self.curve_fourth, self.curve_fifth), strict=True
-        ):
-            before, here = here, ((2 * n - 1) * place * here - (n - 1) * before) / n
-            found = found + part * here
-        return self.half_stroke_um * found
+        parts = self.curve_second, self.curve_third, self.curve_fourth, self.curve_fifth
+        return self.half_stroke_um * _legendre(place, parts, 2)

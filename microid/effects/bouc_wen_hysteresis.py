@@ -12,6 +12,7 @@ from microid._part import AbstractPart, Scene, Signal, innermost
 from microid._preisach import Preisach
 from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._grids import _decades
+from microid.effects._legendre import _legendre
 
 # Steps of the classical Runge-Kutta rule per sample, and per move before the record.
 _SUBSTEPS, _PAST_SUBSTEPS = 2, 32
@@ -131,11 +132,8 @@ class BoucWenHysteresis(AbstractEffect):
 
     def _varied(self, place: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Gain and loss at places in the range, from -1 to 1."""
-        second, third = (3 * place**2 - 1) / 2, (5 * place**3 - 3 * place) / 2
-        fourth = (35 * place**4 - 30 * place**2 + 3) / 8
-        gain = self.gain_first * place + self.gain_second * second
-        gain += self.gain_third * third + self.gain_fourth * fourth
-        return jnp.exp(gain), jnp.exp(self.loss_first * place + self.loss_second * second)
+        gain = _legendre(place, (self.gain_first, self.gain_second, self.gain_third, self.gain_fourth))
+        return jnp.exp(gain), jnp.exp(_legendre(place, (self.loss_first, self.loss_second)))
 
     def _along(self, state: Float[Array, ""], voltage_V: Float[Array, " t"], substeps: int) -> Float[Array, " t-1"]:
         """The state at all voltages but the first, at which it is given."""
