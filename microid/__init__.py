@@ -13,8 +13,8 @@ from microid._late import late as _late
 # fmt: off
 __all__ = [  # noqa: RUF022
     # A stage and its parts
-    "Driver", "HystereticMechanics", "HystereticModes", "Mechanics", "Modes", "Piezo", "Reversible", "Sensor",
-    "Stage", "Start", "with_plays",
+    "Driver", "HystereticMechanics", "HystereticModes", "Lag", "Mechanics", "Modes", "Piezo", "Reversible",
+    "Sensor", "Stage", "Start", "with_plays",
     # What parts are made of
     "AbstractHysteresis", "AbstractLinear", "AbstractPart", "AbstractStepper", "Hold", "LinearSystem", "Scene",
     "Signal", "innermost", "recur", "refined",
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
         Signal,
         innermost,
     )
-    from microid._plant import Driver, Mechanics, Piezo, Sensor
+    from microid._plant import Driver, Lag, Mechanics, Piezo, Sensor
     from microid._preisach import Preisach
     from microid._refine import refined
     from microid._reversible import Reversible

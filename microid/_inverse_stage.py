@@ -9,7 +9,7 @@ from microid._inverse import invert
 from microid._linear import Times
 from microid._memory import Staircase
 from microid._part import AbstractLinear, AbstractPart
-from microid._plant import Driver, Mechanics
+from microid._plant import Driver, Lag, Mechanics
 from microid._preisach import Preisach
 from microid._stage import Stage
 
@@ -51,7 +51,7 @@ def invert_stage(
     Parameters
     ----------
     stage
-        Made of `Driver`, `Piezo` or `Preisach`, `Mechanics`, `Sensor`, and linear parts without states.
+        Made of `Driver`, `Piezo` or `Preisach`, `Lag`, `Mechanics`, `Sensor`, and linear parts without states.
     time_s
         Increasing times, shape `(n,)`, or the one interval between all samples, shape `()`. No derivative flows
         into them.
@@ -146,9 +146,9 @@ def _piezo(stage: Stage) -> int:
 
 
 def _undo(name: str, part: AbstractPart, time_s: Times, signal: Float[Array, " n"]) -> Float[Array, " n"]:
-    if isinstance(part, Driver):
+    if isinstance(part, Driver | Lag):
         slope, _ = _derivatives(time_s, signal)
-        return (signal + part.time_constant_s * slope) / part.gain
+        return (signal + part.time_constant_s * slope) / part.static_gain
     if isinstance(part, Mechanics):
         slope, bend = _derivatives(time_s, signal)
         rate = 2 * jnp.pi * part.natural_frequency_Hz

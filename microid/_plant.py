@@ -1,4 +1,4 @@
-"""The linear parts of a stage: driver, unloaded and loaded piezo, mechanics and sensor (Eq. 12-18)."""
+"""The linear parts of a stage: driver, lag, unloaded and loaded piezo, mechanics and sensor (Eq. 12-18)."""
 
 from typing import ClassVar, Self
 
@@ -47,6 +47,40 @@ class Driver(AbstractLinear):
         """`k / (tau s + 1)`, in V/V."""
         s = jnp.asarray(s_rad_per_s)
         return self.gain.astype(s.dtype) / (1 + self.time_constant_s.astype(s.dtype) * s)
+
+    @property
+    def poles_rad_per_s(self) -> Complex[Array, " 1"]:
+        """The one pole, `-1 / tau`."""
+        return _complex(-1 / self.time_constant_s[None])
+
+
+class Lag(AbstractLinear):
+    r"""A lag of the first order behind the hysteresis: of the charge, where the driver follows its command at once.
+
+    .. math:: \tau \dot y + y = x
+
+    The paper has the lag ahead of the hysteresis (`Driver`); a stage of a hysteresis and a linear plant behind it
+    (Hammerstein) has this.
+
+    Attributes
+    ----------
+    time_constant_s
+        `tau`.
+    """
+
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=1e-3, lower=1e-9)
+
+    def system(self) -> LinearSystem:
+        """The lag as a differential equation; its state is what it gives."""
+        one = jnp.ones_like(self.time_constant_s)
+        return LinearSystem(-1 / self.time_constant_s[None, None], one[None], one[None], one, 0 * one)
+
+    def transfer(self, s_rad_per_s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """`1 / (tau s + 1)`, in um/um."""
+        s = jnp.asarray(s_rad_per_s)
+        return 1 / (1 + self.time_constant_s.astype(s.dtype) * s)
 
     @property
     def poles_rad_per_s(self) -> Complex[Array, " 1"]:

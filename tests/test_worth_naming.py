@@ -16,12 +16,12 @@ from fits.diagnosis._thresholds import Thresholds
 from microid.effects.dropped_samples import DroppedSamples
 
 
-def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), weak=()):
+def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), uneven=()):
     """Names that are kept where each cause explains a part of its own, in noise variances, and so much is left.
 
     With each of those that are harmful, what was held out is predicted worse, and with those that are helpful better;
-    the strengths of those that are unsure are nearer to none than their standard deviation, and of those that are
-    weak there is little evidence.
+    the strengths of those that are unsure are nearer to none than their standard deviation, and those that are uneven
+    are in some runs and not in others.
     """
 
     def cost(names):
@@ -30,7 +30,9 @@ def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), we
     def model(names):
         errors = np.ones(100) * (1 + sum(name in harmful for name in names)) / (1 + sum(n in helpful for n in names))
         strength_z = [0.5 if name in unsure else 9.0 for name in names]
-        return SimpleNamespace(cost=cost(names), change_um=errors, strength_z=strength_z.__getitem__)
+        even = [name not in uneven for name in names]
+        each = {"strength_z": strength_z.__getitem__, "in_each_run": lambda k, *_: even[k]}
+        return SimpleNamespace(cost=cost(names), change_um=errors, **each)
 
     def without(found, name):
         return model([cause.name for cause in found.causes if cause.name != name])
@@ -41,7 +43,7 @@ def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), we
     monkeypatch.setattr(_misfit, "_without", without)
     monkeypatch.setattr(_misfit, "_in_noise", lambda found, _: found)
     monkeypatch.setattr(_misfit, "_misfit", misfit_of)
-    causes = tuple(Cause(name, 6.0 if name in weak else 9.0, 0.0, (), part) for name, part in parts.items())
+    causes = tuple(Cause(name, 9.0, 0.0, (), part) for name, part in parts.items())
     projector = SimpleNamespace(held_out=lambda errors: errors)
     found = Selection(causes, model([*parts]), *(None,) * 5, projector, None)
     ready = SimpleNamespace(reading=SimpleNamespace(thresholds=Thresholds()))
@@ -60,7 +62,7 @@ def test_what_the_rest_may_make_is_not_named(monkeypatch):
     parts = {"transport_delay": 8000.0, "thermal_gain": 170.0, "creep": 90.0}
     every = {"helpful": [*parts]}
     assert named_beside(monkeypatch, parts, chance + 2500.0, **every) == ["transport_delay"]
-    assert named_beside(monkeypatch, parts, chance) == [*parts]
+    assert named_beside(monkeypatch, parts, chance, **every) == [*parts]
     # A third of what there is beside the others is more than a minor share.
     assert named_beside(monkeypatch, parts, chance + 300.0, **every) == ["transport_delay", "thermal_gain"]
     # One cause alone is decided on by its share of the whole misfit; a hum is no other effect's misfit.
@@ -102,14 +104,25 @@ def test_what_may_be_none_is_named_only_where_it_predicts(monkeypatch):
     assert named_beside(monkeypatch, {"creep": 8000.0}, chance, unsure=["creep"], helpful=["creep"]) == ["creep"]
 
 
-def test_what_is_weak_and_small_is_named_beside_others_only_where_it_predicts(monkeypatch):
-    parts, weak = {"creep": 8000.0, "thermal_drift": 40.0}, ["thermal_drift"]
+def test_what_is_small_is_named_beside_others_only_where_it_predicts(monkeypatch):
+    """A second resonance of a tenth of the noise was, at 21 standard deviations, beside a creep that was there."""
+    parts, small = {"creep": 8000.0, "thermal_drift": 440.0}, ["thermal_drift"]
     chance = 40 + 3 * 80**0.5
-    assert named_beside(monkeypatch, parts, chance) == [*parts]
-    assert named_beside(monkeypatch, parts, chance, weak=weak) == ["creep"]
-    assert named_beside(monkeypatch, parts, chance, weak=weak, helpful=weak) == [*parts]
+    assert named_beside(monkeypatch, parts, chance) == ["creep"]
+    assert named_beside(monkeypatch, parts, chance, helpful=small) == [*parts]
     # What is as large as a third of the noise need not.
-    assert named_beside(monkeypatch, {**parts, "thermal_drift": 1000.0}, chance, weak=weak) == [*parts]
+    assert named_beside(monkeypatch, {**parts, "thermal_drift": 1000.0}, chance) == [*parts]
+    # Nothing else is like a hum, and its phase in other runs is another.
+    assert named_beside(monkeypatch, {"creep": 8000.0, "mains_hum": 440.0}, chance) == ["creep", "mains_hum"]
+
+
+def test_a_hum_is_in_every_run(monkeypatch):
+    """Harmonics of a sine that met a soft rail were called one, thirty times as large as in the other run."""
+    parts, chance = {"creep": 8000.0, "mains_hum": 4000.0}, 40 + 3 * 80**0.5
+    assert named_beside(monkeypatch, parts, chance, uneven=["mains_hum"]) == ["creep"]
+    assert named_beside(monkeypatch, {"mains_hum": 4000.0}, chance, uneven=["mains_hum"]) == []
+    # What a load does to one run is that run's.
+    assert named_beside(monkeypatch, {"load_change": 4000.0}, chance, uneven=["load_change"]) == ["load_change"]
 
 
 @pytest.mark.parametrize(

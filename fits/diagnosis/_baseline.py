@@ -168,10 +168,14 @@ def fit_baseline(
     if left_out:
         return _static(records, aside, range_V, holdout, initial, past, left_out, progress)
     try:
-        near = None if onward is None else onward.held(hold)
+        # Steps are fitted only behind a driver.
+        usable = onward is not None and ("zero" not in holds or bool(named_parts(onward.stage, Driver)))
+        near = onward.held(hold) if onward is not None and usable else None
         stage = default_stage(hold) if near is None else near.stage
         settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
-        found = solve_stage(*settings, accept_best=True, estimated=past, onward=near, holds=holds)
+        # Behind steps a lag was not looked for anywhere else.
+        movable = near is None or (onward is not None and onward.stage.hold == "zero")
+        found = solve_stage(*settings, accept_best=True, estimated=past, onward=near, holds=holds, movable=movable)
     except (DataError, FitError) as error:
         # That is what is done.
         why = str(error).removesuffix(BESIDE_A_LAG).removesuffix(f", {OR_ALONE}")

@@ -61,10 +61,13 @@ class Bench:
         asked = [effect for effect in effects if slow or not (effect.fast and effect.per_run)]
         return [without_drifts(effect, interval_s, record.duration_s) for effect in asked]
 
-    def change(self, effects: Sequence[AbstractEffect]) -> list[np.ndarray]:
-        """What effects that all runs share change in them, in um."""
-        moved = self.respond([effects] * len(self.plain))
-        return [one - plain for one, plain in zip(moved, self.plain, strict=True)]
+    def change(
+        self, effects: Sequence[AbstractEffect], beside: Sequence[Sequence[AbstractEffect]] = ()
+    ) -> list[np.ndarray]:
+        """What effects that all runs share change in them, in um, `beside` those that each of them has."""
+        before = self.respond(beside) if beside else self.plain
+        moved = self.respond([[*have, *effects] for have in beside or [()] * len(self.plain)])
+        return [one - plain for one, plain in zip(moved, before, strict=True)]
 
 
 def drop_programs(records: Sequence[Record]) -> None:

@@ -10,11 +10,13 @@ from fits.diagnosis._effects import Bench
 from fits.diagnosis._joint_fit import State
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing
-from fits.diagnosis._score import Family, Probe, Scored, score
+from fits.diagnosis._residual_tests import period_of, repeats_in
+from fits.diagnosis._score import Family, Probe, Scored, applicable, probes_of, scales_of, score
 from fits.diagnosis._thresholds import Thresholds
 from fits.stage._solve import Problem
 from fits.stats._compare import is_worse
-from microid.effects import card_of
+from fits.stats._noise import quantum_um
+from microid.effects import EFFECTS, card_of
 
 # The farthest that a standard deviation in coordinates is taken at its word.
 _FARTHEST = 3.0
@@ -83,10 +85,22 @@ class Search:
     thresholds: Thresholds
     has_time: Callable[[], bool]
 
-    @property
-    def candidates(self) -> list[tuple[np.ndarray, ...]]:
-        """The signatures of all effects."""
-        return [column for probe in self.probes for column in probe.signatures]
+    def beside(self, bench: Bench, projector: Projector, model: Refit) -> tuple[Probe, ...]:
+        """All probes beside a model: those, too, of a period in the position that only shows without its effects."""
+        asked = {probe.form for probe in self.probes}
+        forms = [form for form in EFFECTS if form.origin and form not in asked]
+        forms = [form for form in forms if model.laws and applicable(bench.baseline, form) is None]
+        if not forms:
+            return self.probes
+        moved = [plain + change for plain, change in zip(bench.plain, model.change_um, strict=True)]
+        step_um = max(quantum_um(run.displacement_um) for run in bench.baseline.runs)
+        left = projector.off(projector.residual - projector.join(model.change_um))
+        found = period_of(repeats_in(projector, left, moved), step_um, self.thresholds)
+        if found is None:
+            return self.probes
+        scales = scales_of(bench, min(noise.total_um for noise in projector.noise), found)
+        have = [model.effects(run) for run in range(len(moved))]
+        return (*self.probes, *(p for form in forms for p in probes_of(bench, form, scales, None, have)))
 
 
 @dataclass(frozen=True)
@@ -111,7 +125,7 @@ class Explanation:
     def of(cls, causes: Sequence[Cause], state: State, search: Search) -> "Explanation":
         """Ask for all effects beside these causes."""
         bench, projector, model = state
-        scores = score(projector, search.probes, model.residual, model.basis())
+        scores = score(projector, search.beside(bench, projector, model), model.residual, model.basis())
         names, explained = {cause.name for cause in causes}, search.plain.cost - model.cost
         ahead = gain_ahead(scores.each, names, explained, search.thresholds)
         held = projector.held_out(model.change_um)

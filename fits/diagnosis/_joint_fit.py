@@ -15,6 +15,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, refit
 from fits.diagnosis._regression import regress, saturating
 from fits.diagnosis._relocate import relocate
+from fits.diagnosis._score import Probe
 from fits.diagnosis._thresholds import Thresholds
 from fits.io._threads import map_in_threads
 from fits.stage._run import named_parts
@@ -262,15 +263,16 @@ def relearn_noise(
     first: Projector,
     projector: Projector,
     model: Refit,
-    candidates: Sequence[Sequence[np.ndarray]],
+    ask: Callable[[Projector], Sequence[Probe]],
     thresholds: Thresholds,
 ) -> Projector | None:
     """The projector without causes, with noise and smoothness as they are beside them, where either was misjudged.
 
-    Noise is that of the sensor and what neither the causes nor any of the `candidates` explain.
+    Noise is that of the sensor, and what neither the causes explain nor any effect that is asked for beside that.
     """
     sensor = find_faults(projector.regression, model.change_um, thresholds).noise
     beside = projector.beside(sensor)
+    candidates = [column for probe in ask(beside) for column in probe.signatures]
     found = with_discrepancy(beside, candidates, model.change_um)
     less = [new.total_um < _LESS * old.total_um for new, old in zip(found, projector.noise, strict=True)]
     noise = found if any(less) else projector.noise

@@ -11,7 +11,7 @@ from fits.diagnosis._score import Scored, score
 from fits.diagnosis._thresholds import Thresholds
 from fits.io._threads import map_in_threads
 from fits.stage._run import named_parts
-from microid import Driver, Mechanics
+from microid import Driver, Lag, Mechanics
 
 # A resonance that is damped less rings, and is not mistaken for a delay.
 _RINGS = 0.2
@@ -34,7 +34,7 @@ def may_be_of_driver(plain: PlainFit, thresholds: Thresholds) -> bool:
 
 def lag_of(plain: PlainFit) -> float:
     """How late the readings are, in s: as its driver and mechanics have it, or as a delay shows them."""
-    parts = [part for _, part in named_parts(plain.regression.baseline.stage, Driver, Mechanics)]
+    parts = [part for _, part in named_parts(plain.regression.baseline.stage, Driver, Lag, Mechanics)]
     if not parts:
         return plain.late()[1]
     return float(sum(np.sum(-1 / part.poles_rad_per_s).real for part in parts))

@@ -84,8 +84,9 @@ def worth_naming(
 ) -> tuple[Selection, Selection, Misfit, Cycles, list[str]]:
     """Leave out causes that are not worth naming beside the others, the worst first.
 
-    Their strength may be none, they make predictions of what was held out worse, or are weak and small and make them
-    no better, or they explain a minor share of what the others leave: what explains the rest may explain that.
+    Their strength may be none, they make predictions of what was held out worse, or are small and make them no
+    better, are in some runs and not in others though they depend on no command, or explain a minor share of what the
+    others leave: what explains the rest may explain that.
     Returns what was found, the same in the given noise, and what is said of causes that were left out.
     """
     said: list[str] = []
@@ -104,7 +105,13 @@ def worth_naming(
 def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str] | None:
     """Why a cause is not worth naming beside the others, and how much so, the least first; None where it is."""
     thresholds, alone = misfit.thresholds, all(cause.name == name for cause in found.causes)
-    strength_z = max(found.model.strength_z(k) for k, cause in enumerate(found.causes) if cause.name == name)
+    card = card_of(name)
+    laws = [k for k, cause in enumerate(found.causes) if cause.name == name]
+    strength_z = max(map(found.model.strength_z, laws))
+    if card.independent and not all(
+        found.model.in_each_run(k, thresholds.minor_share, thresholds.apart_z) for k in laws
+    ):
+        return -np.inf, name, "it would be in some runs and not in others, and what depends on no command is in all"
     if alone and strength_z >= 1:
         return None
     fewer = _without(found, name)
@@ -117,12 +124,11 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
         worse = float(np.sum(after**2) - np.sum(before**2))
         return -worse, name, "what was held out is predicted worse with it than with the other causes alone"
     explained = fewer.cost - found.model.cost
-    weak = max(cause.z for cause in found.causes if cause.name == name) < thresholds.strong_z
-    small = explained < thresholds.rest_noise**2 * misfit.count
-    if weak and small and improvement_z(before, after) < thresholds.worse_z:
-        why = "it is weak and small, and nothing that was held out is predicted better with it"
+    # A hum has another phase in the next run, and nothing else is like it.
+    small = explained < thresholds.rest_noise**2 * misfit.count and not card.independent
+    if small and improvement_z(before, after) < thresholds.worse_z:
+        why = "it is small beside the noise, and nothing that was held out is predicted better with it"
         return -1 / max(explained, 1e-300), name, why
-    card = card_of(name)
     # Beside a rest of another kind any evidence looks large; of what one run had of its own others say nothing.
     alike = misfit.is_left_over and not (card.independent or card.per_run)
     if alike and improvement_z(before, after) < thresholds.worse_z / 2:

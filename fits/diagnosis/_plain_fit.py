@@ -13,7 +13,7 @@ from fits.diagnosis._noise import Faults
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import nothing, refit, refit_beside
 from fits.diagnosis._regression import Regression
-from fits.diagnosis._residual_tests import repeats_in
+from fits.diagnosis._residual_tests import period_of, repeats_in
 from fits.diagnosis._score import Probe, Scored, applicable, law_of, probes_of, scales_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._threads import map_in_threads
@@ -60,10 +60,7 @@ class PlainFit:
     @cached_property
     def scales(self) -> Scales:
         repeated = repeats_in(self.projector, self.left, self.bench.plain)
-        # What repeats itself with the step of the readings is their rounding.
-        step_um = self.faults.quantum_um
-        rounding = step_um > 0 and abs(repeated.period_um / step_um - 1) < self.thresholds.model_error
-        period_um = repeated.period_um if repeated.z > self.thresholds.cycles and not rounding else None
+        period_um = period_of(repeated, self.faults.quantum_um, self.thresholds)
         return scales_of(self.bench, min(noise.total_um for noise in self.faults.noise), period_um)
 
     @cached_property
@@ -304,6 +301,9 @@ class PlainFit:
             if is_far_less(min(near, far), max(near, far), noise):
                 return near < far
         rest = whole - other.largest_z() ** 2
+        # Lines that leave no more, alone and beside the best effect, are kept.
+        if here <= whole and here - self.largest_z() ** 2 <= rest:
+            return True
         if rest <= (1 + _NOISE) * noise:
             return False
         # Of what is more than noise either way, a small part decides nothing, unless the best effect explains less.

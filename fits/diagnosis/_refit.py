@@ -123,13 +123,22 @@ class Refit:
 
     def strength_z(self, k: int) -> float:
         """Standard deviations of a law's strength from zero, in the run that shows it best; infinite without one."""
-        law, x = self.laws[k], self.x[k]
-        if not law.form.strength:
+        if not self.laws[k].form.strength:
             return np.inf
+        return max(float(np.max(np.abs(here) / np.maximum(sd, 1e-300))) for here, sd in self._strengths(k))
+
+    def in_each_run(self, k: int, part: float, apart_z: float) -> bool:
+        """Whether a law may be at least a part as strong in every run as in that where it is strongest."""
+        each = self._strengths(k)
+        least = part * max(float(np.linalg.norm(here)) for here, _ in each)
+        return all(np.linalg.norm(np.abs(here) + apart_z * sd) >= least for here, sd in each)
+
+    def _strengths(self, k: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Strengths of a law in each run, and their standard deviations."""
+        law, x = self.laws[k], self.x[k]
         own = slice(start := sum(other.size for other in self.laws[:k]), start + law.size)
         covariance = self.covariance()[own, own]
-        each = [_strength(law, x, run, np.arange(law.size), covariance) for run in range(len(law.maps))]
-        return max(float(np.max(np.abs(here) / np.maximum(sd, 1e-300))) for here, sd in each)
+        return [_strength(law, x, run, np.arange(law.size), covariance) for run in range(len(law.maps))]
 
     def possible(self, bench: Bench) -> bool:
         """Whether what went on in the last effect before the runs is no more than moves of the rig leave behind."""

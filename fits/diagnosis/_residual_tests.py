@@ -179,6 +179,12 @@ def repeats_in(projector: Projector, residual: np.ndarray, plain_um: Sequence[np
     return cycles(projector.split(residual), positions)
 
 
+def period_of(repeated: Cycles, step_um: float, thresholds: Thresholds = THRESHOLDS) -> float | None:
+    """The period, in um, if it is none of chance nor of the rounding of readings to multiples of `step_um`."""
+    rounding = step_um > 0 and abs(repeated.period_um / step_um - 1) < thresholds.model_error
+    return repeated.period_um if repeated.z > thresholds.cycles and not rounding else None
+
+
 def irregular(
     projector: Projector, residual: np.ndarray, thresholds: Thresholds = THRESHOLDS
 ) -> tuple[tuple[Test, ...], bool]:

@@ -98,9 +98,16 @@ def applicable(baseline: Baseline, form: type[AbstractEffect]) -> str | None:
 
 
 def probes_of(
-    bench: Bench, form: type[AbstractEffect], scales: Scales, projector: Projector | None = None
+    bench: Bench,
+    form: type[AbstractEffect],
+    scales: Scales,
+    projector: Projector | None = None,
+    beside: Sequence[Sequence[AbstractEffect]] = (),
 ) -> Iterator[Probe]:
-    """Simulate all probes of an effect, and with a projector those that begin where the residual says, too."""
+    """Simulate all probes of an effect, and with a projector those that begin where the residual says, too.
+
+    `beside` are effects that each run has already.
+    """
     place = host(form, bench.stage)
     inner = None if place is None else bench.stage.parts[place]
     groups = form.probes(scales, inner)
@@ -111,7 +118,7 @@ def probes_of(
             continue
         columns: list[tuple[np.ndarray, ...]] = []
         for effect in group:
-            change = _change(bench, effect)
+            change = _change(bench, effect, beside)
             if form.per_run and len(change) > 1:
                 nothing = [np.zeros_like(c) for c in change]
                 columns += [(*nothing[:k], own, *nothing[k + 1 :]) for k, own in enumerate(change)]
@@ -127,10 +134,13 @@ def _is_allowed(effect: AbstractEffect) -> bool:
     return all(spec is None or np.all((spec.lower <= x) & (x <= spec.upper)) for x, spec in known)
 
 
-def _change(bench: Bench, effect: AbstractEffect) -> list[np.ndarray]:
+def _change(
+    bench: Bench, effect: AbstractEffect, beside: Sequence[Sequence[AbstractEffect]] = ()
+) -> list[np.ndarray]:
     """What an effect changes in each run; of one that grows with its strength, the derivative where it is weak."""
     share = 1.0 if effect.finite else 1e-2
-    return [c / share for c in bench.change([effect if effect.finite else times(effect, share)])]
+    one = effect if effect.finite else times(effect, share)
+    return [c / share for c in bench.change([one], beside)]
 
 
 def _from_onsets(bench: Bench, projector: Projector, effect: AbstractEffect) -> list[AbstractEffect]:

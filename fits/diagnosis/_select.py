@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -68,7 +69,8 @@ def select(
         ranked = sorted(grown.values(), key=lambda one: one[1].criterion)
         order = [one for _, one in ranked]
         if order and again and not beam[0].causes:
-            afresh = relearn_noise(projector, order[0].projector, order[0].model, search.candidates, thresholds)
+            ask = partial(search.beside, order[0].bench, model=order[0].model)
+            afresh = relearn_noise(projector, order[0].projector, order[0].model, ask, thresholds)
             if afresh is not None:
                 # The cause was taken for noise or roughness, too: all is asked again beside what there is of them.
                 settings = probes, false_alarm, rng, progress, thresholds, has_time

@@ -23,6 +23,7 @@ from fits.loop._stepped import refuse_many_steps
 from fits.stage._before import memory_before
 from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
+from fits.stage._lag_place import placed_onward
 from fits.stage._plan import Plan
 from fits.stage._run import (
     free_grid,
@@ -173,13 +174,14 @@ def solve_stage(
     estimated: Sequence[bool] = (),
     onward: Problem | None = None,
     holds: Sequence[m.Hold] = (),
+    movable: bool | None = None,
 ) -> Solution:
     """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
 
     `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
     adds is `estimated` beside the rest for some records: of those given, or of any that would lose most of its
     samples to it. The fit goes `onward` from another one, or begins where the runs say. Commands run between samples
-    as the stage says, or each as one of `holds`.
+    as the stage says, or each as one of `holds`. The lag is `movable` behind the hysteresis unless a stage is given.
     """
     fraction, _, range_V = check_fit(records, holdout, loss, levels)
     for record in records:
@@ -187,6 +189,7 @@ def solve_stage(
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
     if len(states) != len(records):
         raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
+    movable = stage is None if movable is None else movable
     stage = default_stage() if stage is None else stage
     if not estimated and free_grid(stage) is not None and set(states) == {"unknown"}:
         estimated = pasts_to_estimate(records, range_V, fraction, MOST)
@@ -201,9 +204,10 @@ def solve_stage(
         tuple(holds) or (stage.hold,) * len(records),
         accept_best=accept_best,
         estimated=tuple(estimated),
+        movable=movable,
     )
     if onward is not None:
-        problem = onward
+        problem = placed_onward(plan, onward) if movable else onward
     elif starts_as_it_is(stage):
         if levels is not None:
             raise DataError(f"levels is {levels}, and the stage has no hysteresis on a grid: leave it out")

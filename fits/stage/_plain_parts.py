@@ -27,6 +27,10 @@ def _driver(time_constant_s: complex, gain: complex) -> Linear:
     return Linear(np.array([[-1 / time_constant_s]]), one, gain * one, gain, 0.0)
 
 
+def _lag(time_constant_s: complex) -> Linear:
+    return _driver(time_constant_s, 1.0)
+
+
 def _mechanics(natural_frequency_Hz: complex, damping_ratio: complex, gain: complex) -> Linear:
     rate = 2 * np.pi * natural_frequency_Hz
     matrix = np.array([[0.0, rate], [-rate, -2 * damping_ratio * rate]])
@@ -37,7 +41,12 @@ def _sensor(gain: complex, offset_um: complex) -> Linear:
     return Linear.memoryless(gain, offset_um)
 
 
-SYSTEMS: Mapping[str, Callable[..., Linear]] = {"Driver": _driver, "Mechanics": _mechanics, "Sensor": _sensor}
+SYSTEMS: Mapping[str, Callable[..., Linear]] = {
+    "Driver": _driver,
+    "Lag": _lag,
+    "Mechanics": _mechanics,
+    "Sensor": _sensor,
+}
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ class Plan:
     """What was asked for, and of which records an unknown past is `estimated`; of none where that is empty.
 
     The command of each record runs between samples as `holds` say, and comes `shifts_s` later; samples that have
-    `settled`, `(n,)`, are fitted.
+    `settled`, `(n,)`, are fitted. Where its lag is `movable`, the stage may have it behind the hysteresis.
     """
 
     records: tuple[Record, ...]
@@ -32,6 +32,7 @@ class Plan:
     estimated: tuple[bool, ...] = ()
     shifts_s: tuple[float, ...] = ()
     settled: tuple[np.ndarray, ...] = ()
+    movable: bool = False
 
     def runs(self, strides: Sequence[int] = ()) -> list[Run]:
         """The records, the intervals of each divided into so many steps, or not at all."""

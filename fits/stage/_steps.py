@@ -16,6 +16,7 @@ from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Run, simulate_run
 from fits.stage._chain import offsets_out
 from fits.stage._checks import UNSEEN, check_gains, refuse_slopes, refuse_unidentifiable, shows_poles, speed_Hz
+from fits.stage._lag_place import lag_placed
 from fits.stage._plan import Plan
 from fits.stage._run import (
     free_grid,
@@ -26,15 +27,13 @@ from fits.stage._run import (
     yields_inside,
 )
 from fits.stage._solve import Problem, Solved, solve_chain, try_chain
-from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages, with_lag_elsewhere
+from fits.stage._start import MeasuredResponse, measure_response, start_lagging, start_stages
 from fits.stage._uncertainty import Precision
 from microid import Driver, Mechanics, Preisach, Stage, innermost
 from microid.effects import EFFECTS
 
 # Where a part is left out more than noise is left, and no run counts as quieter than another.
 _EVEN = 1.0
-# What is left, in noise of the sensor, from which on a driver and a damped mode may have taken each other's place.
-_MORE = 1.5
 # How many times what a start leaves, on average, is too much beside one that has a lag of the reading, too.
 _BAD = 3.0
 # How many times what is left beside a mode, on average, must be left beside a lag of the reading instead.
@@ -130,7 +129,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         # A hysteresis read off runs that are all as fast has taken in the lag of the driver.
         other = _from_command(plan, problem, runs, starts, lag_beside) if fast == slow else None
         if other is not None and _identifiable(other, drives, False):
-            return _lag_placed(plan, other).onward
+            return lag_placed(plan, other).onward
         if not plan.accept_best:
             if fast == slow and (lagging := _lagging(plan, problem, runs, drives)):
                 return lagging
@@ -146,7 +145,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         refuse_unidentifiable(beside, drives, fast=fast != slow)
         return _without_lag(problem, beside)
     if fitted is not None:
-        freed = _lag_placed(plan, solved)
+        freed = lag_placed(plan, solved)
         if any(one.far for one in misfits(runs, freed.residuals_um)):
             freed = _freed(plan, freed, drives, responses, fast != slow)
         if plan.accept_best or _identifiable(freed, drives, fast != slow):
@@ -157,7 +156,7 @@ def start_problem(plan: Plan, stage: Stage, levels: int | None, finest: int) -> 
         simpler = start_problem(plan, asked.without(dropped), levels, finest)
         remarks = (_no_resonance(plan, dropped), *simpler.remarks)
         return replace(simpler, least_noise_share=_EVEN, remarks=remarks, full=solved)
-    return replace(problem, remarks=tuple(check_gains(solved.stage, runs)))
+    return replace(problem, remarks=(*problem.remarks, *check_gains(solved.stage, runs)))
 
 
 def _from_command(
@@ -180,17 +179,6 @@ def _from_command(
     best = min(found, key=lambda one: one.cost)
     least = math.log(_CLEAR) * sum(int(run.fitted.sum()) for run in runs)
     return best if best.cost < beside.cost - least else None
-
-
-def _lag_placed(plan: Plan, solved: Solved) -> Solved:
-    """Go on from a rough fit with the hysteresis free, and with the lag in the driver or in the mode."""
-    runs, settings = solved.runs, (plan.loss, plan.progress)
-    solved = try_chain(solved.onward, runs, *settings, rough=True) or solved
-    if not any(one.times_noise > _MORE for one in misfits(runs, solved.residuals_um)):
-        return solved
-    places = [np.asarray(solved.problem.chain.coordinates.of(stage)) for stage in with_lag_elsewhere(solved.stage)]
-    moved = (try_chain(replace(solved.onward, z=z), runs, *settings, rough=True) for z in places)
-    return min(filter(None, (solved, *moved)), key=lambda one: one.cost)
 
 
 def _freed(

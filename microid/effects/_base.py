@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._part import AbstractHysteresis, AbstractPart, Signal, innermost
-from microid._plant import Driver, Mechanics
+from microid._plant import Driver, Lag, Mechanics
 from microid._stage import Stage
 
 Place = Literal["driver", "hysteresis", "mechanics", "environment", "sensor", "time", "noise"]
@@ -297,6 +297,8 @@ def _rank(part: AbstractPart) -> float:
     inner = innermost(part)
     if isinstance(inner, AbstractHysteresis):
         return PLACES.index("hysteresis") - 0.5
+    if isinstance(inner, Lag):
+        return PLACES.index("hysteresis") + 0.5
     if isinstance(inner, Mechanics):
         # What acts on the mechanics from before is ahead of them.
         return PLACES.index("mechanics") + 0.5
