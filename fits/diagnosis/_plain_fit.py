@@ -300,6 +300,9 @@ class PlainFit:
             near, far = self.left_beside_best, there.left_beside_best
             if is_far_less(min(near, far), max(near, far), noise):
                 return near < far
+        if max(here, whole) <= (1 + _NOISE) * noise:
+            # Of noise alone no more than chance is left less by either.
+            return self.missed_um2 <= other.missed_um2
         rest = whole - other.largest_z() ** 2
         # Lines that leave no more, alone and beside the best effect, are kept.
         if here <= whole and here - self.largest_z() ** 2 <= rest:
