@@ -86,21 +86,27 @@ class Search:
     has_time: Callable[[], bool]
 
     def beside(self, bench: Bench, projector: Projector, model: Refit) -> tuple[Probe, ...]:
-        """All probes beside a model: those, too, of a period in the position that only shows without its effects."""
-        asked = {probe.form for probe in self.probes}
-        forms = [form for form in EFFECTS if form.origin and form not in asked]
-        forms = [form for form in forms if model.laws and applicable(bench.baseline, form) is None]
+        """All probes beside a model, those of a period in the position where its effects put that."""
+        taken = {law.form.name for law in model.laws}
+        forms = [form for form in EFFECTS if form.origin and form.name not in taken]
+        forms = [form for form in forms if taken and applicable(bench.baseline, form) is None]
         if not forms:
             return self.probes
-        moved = [plain + change for plain, change in zip(bench.plain, model.change_um, strict=True)]
-        step_um = max(quantum_um(run.displacement_um) for run in bench.baseline.runs)
-        left = projector.off(projector.residual - projector.join(model.change_um))
-        found = period_of(repeats_in(projector, left, moved), step_um, self.thresholds)
+        readings_um = [run.displacement_um for run in bench.baseline.runs]
+        left = projector.residual - projector.join(model.change_um)
+        found = period_of(
+            repeats_in(projector, projector.off(left), readings_um),
+            max(map(quantum_um, readings_um)),
+            self.thresholds,
+        )
         if found is None:
             return self.probes
-        scales = scales_of(bench, min(noise.total_um for noise in projector.noise), found)
-        have = [model.effects(run) for run in range(len(moved))]
-        return (*self.probes, *(p for form in forms for p in probes_of(bench, form, scales, None, have)))
+        # Where the stage goes beside these effects, and not without.
+        there = Bench(projector.move(left))
+        scales = scales_of(there, min(noise.total_um for noise in projector.noise), found)
+        have = [model.effects(run) for run in range(len(readings_um))]
+        more = [probe for form in forms for probe in probes_of(there, form, scales, None, have)]
+        return (*(probe for probe in self.probes if probe.form not in forms), *more)
 
 
 @dataclass(frozen=True)
