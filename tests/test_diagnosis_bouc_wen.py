@@ -41,20 +41,26 @@ def test_what_forgets_reversals_by_and_by_is_named_and_its_law_found(rng):
     assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
 
 
-@pytest.mark.study
-def test_a_law_whose_curve_is_no_line_is_found_and_a_drift_behind_it(rng):
-    """Coleman and Hodgdon's: the drift had to leave nothing but noise before the law was fitted beside it."""
+def curved_loops(rng):
+    """Time, voltage and displacement of Coleman and Hodgdon's law, its length and its tilt."""
     way_V = np.r_[0, np.cumsum(np.abs(np.diff(TURNS_V)))]
     voltage_V = np.interp(np.arange(0, way_V[-1], 60 / RATE_Hz), way_V, TURNS_V)
-    length_V, tilt, drift_um = rng.uniform(20, 35), rng.choice([-1, 1]) * rng.uniform(0.25, 0.5), 0.12
+    length_V, tilt = rng.uniform(20, 35), rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)
     fine_V = np.interp(np.arange((len(voltage_V) - 1) * PARTS + 1) / PARTS, np.arange(len(voltage_V)), voltage_V)
     z, states = tilt - 1, []
     for here, move in zip(fine_V, np.r_[0.0, np.diff(fine_V)], strict=True):
         z += (move * (1 + tilt * (here / 50 - 1)) - abs(move) * z) / length_V
         states.append(z)
     time_s = np.arange(len(voltage_V)) / RATE_Hz
+    return time_s, voltage_V, 0.2 * voltage_V - 1.5 * np.array(states[::PARTS]), length_V, tilt
+
+
+@pytest.mark.study
+def test_a_law_whose_curve_is_no_line_is_found_and_a_drift_behind_it(rng):
+    """Coleman and Hodgdon's: the drift had to leave nothing but noise before the law was fitted beside it."""
+    time_s, voltage_V, moved_um, length_V, tilt = curved_loops(rng)
     constant_s = rng.uniform(0.2, 0.4) * time_s[-1]
-    truth_um = 0.2 * voltage_V - 1.5 * np.array(states[::PARTS]) + drift_um * -np.expm1(-time_s / constant_s)
+    truth_um = moved_um + 0.12 * -np.expm1(-time_s / constant_s)
     read_um = truth_um + NOISE_um * rng.standard_normal(len(truth_um))
     found = diagnose([Record(time_s, voltage_V, read_um, source="loops.csv")])
     print(length_V, tilt, constant_s, found.summary())
@@ -63,6 +69,23 @@ def test_a_law_whose_curve_is_no_line_is_found_and_a_drift_behind_it(rng):
     value = {one.name: one.value for one in law.parameters}
     assert value["length_share"] == pytest.approx(length_V / 100, rel=0.1)
     assert value["gain_first"] == pytest.approx(np.arctanh(tilt), abs=0.1)
+    assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
+
+
+@pytest.mark.study
+def test_a_cyclic_error_behind_a_law_is_found_where_that_puts_the_stage(rng):
+    """It was asked for at the positions of the plain stage, off by more than a period, and counted as noise then."""
+    time_s, voltage_V, moved_um, length_V, tilt = curved_loops(rng)
+    period_um, phase = rng.uniform(0.25, 0.4), rng.uniform(0, 2 * np.pi)
+    read_um = moved_um + 0.04 * np.sin(2 * np.pi * moved_um / period_um + phase)
+    read_um += NOISE_um * rng.standard_normal(len(read_um))
+    found = diagnose([Record(time_s, voltage_V, read_um, source="loops.csv")])
+    print(length_V, tilt, period_um, found.summary())
+    value = {one.name: {each.name: each.value for each in one.parameters} for one in found.causes}
+    assert {*value} == {"bouc_wen_hysteresis", "cyclic_error"}
+    assert value["cyclic_error"]["period_um"] == pytest.approx(period_um, rel=2e-3)
+    waves_um = [value["cyclic_error"][f"{name}[0]"] for name in ("cosine_um", "sine_um")]
+    assert np.hypot(*waves_um) == pytest.approx(0.04, rel=0.1)
     assert found.gain.heldout_rms_after_um < 1.3 * NOISE_um
 
 

@@ -173,8 +173,8 @@ def fit_baseline(
         near = onward.held(hold) if onward is not None and usable else None
         stage = default_stage(hold) if near is None else near.stage
         settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
-        # Behind steps a lag was not looked for anywhere else.
-        movable = near is None or (onward is not None and onward.stage.hold == "zero")
+        # A lag may have been looked for behind another command.
+        movable = near is None or (onward is not None and onward.stage.hold != hold)
         found = solve_stage(*settings, accept_best=True, estimated=past, onward=near, holds=holds, movable=movable)
     except (DataError, FitError) as error:
         # That is what is done.

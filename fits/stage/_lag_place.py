@@ -19,6 +19,8 @@ _CLEAR, _ALIKE = 1.1, 1.05
 _MORE = 1.5
 # Part of a lag that a driver begins with beside it, and that is none.
 _LITTLE, _NONE = 0.1, 0.02
+# Steps between samples of what is tried.
+_STEPS = 4
 _SAID = (
     "the lag of the stage lies behind the hysteresis in these runs, as that of a linear plant does or of a sensor's "
     "filter, and none shows ahead of it: the stage has no driver"
@@ -79,4 +81,6 @@ def _left(solved: Solved) -> list[Misfit]:
 def _solve(plan: Plan, solved: Solved, stage: Stage) -> Solved | None:
     problem = solved.problem
     there = Problem.of(stage, problem.chain.grid, solved.columns_um, solved.hyper, problem.stroke_um)
-    return try_chain(there, solved.runs, plan.loss, plan.progress, rough=True)
+    # A step of the command within an interval is passed on as a line of as few pieces.
+    runs = plan.runs([_STEPS] * len(plan.records))
+    return try_chain(there, runs, plan.loss, plan.progress, rough=True)
