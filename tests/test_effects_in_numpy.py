@@ -150,6 +150,7 @@ def extended(rng, **options):
         driver=m.Driver(rng.uniform(1e-3, 4e-3), rng.uniform(0.5, 2)),
         hysteresis=random_model(rng),
         creep=drawn(BY_NAME["KelvinVoigtCreep"], rng),
+        lag=m.Lag(rng.uniform(1e-3, 4e-3)),
         mechanics=m.Mechanics(rng.uniform(100, 150), rng.uniform(0.05, 0.5), rng.uniform(1, 4)),
         settling=drawn(BY_NAME["MountRelaxation"], rng),
         sensor=m.Sensor(rng.uniform(0.9, 1.1), rng.normal()),

@@ -55,7 +55,7 @@ def program(rng, stage, even):
 
 
 def test_what_is_declared_is_what_microid_declares():
-    made = {"Driver": m.Driver(1e-3), "Mechanics": m.Mechanics(100.0, 0.1), "Sensor": m.Sensor()}
+    made = {"Driver": m.Driver(1e-3), "Lag": m.Lag(1e-3), "Mechanics": m.Mechanics(100.0, 0.1), "Sensor": m.Sensor()}
     assert set(SYSTEMS) == set(made)
     for kind, part in made.items():
         found = [(name, said.unit, said.scale, said.lower, np.inf) for name, said in declared()[kind].items()]
