@@ -17,7 +17,7 @@ __all__ = [  # noqa: RUF022
     "Sensor", "Stage", "Start", "with_plays",
     # What parts are made of
     "AbstractHysteresis", "AbstractLinear", "AbstractPart", "AbstractStepper", "Hold", "LinearSystem", "Scene",
-    "Signal", "innermost", "recur", "refined",
+    "Signal", "innermost", "recur", "refined", "run_parts",
     # The Preisach operator
     "Everett", "Preisach", "everett", "forest_sum", "respond_all",
     # Memory
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         Scene,
         Signal,
         innermost,
+        run_parts,
     )
     from microid._plant import Driver, Lag, Mechanics, Piezo, Sensor
     from microid._preisach import Preisach

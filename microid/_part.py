@@ -1,8 +1,9 @@
 """What a part of a stage is: something that turns one sampled signal into another."""
 
 import abc
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import reduce
+from itertools import groupby
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -156,6 +157,15 @@ def _joined(parts: Iterable[AbstractLinear]) -> LinearSystem:
     return reduce(LinearSystem.then, (part.system() for part in parts))
 
 
+def _links(parts: Iterable[AbstractPart]) -> list[LinearSystem | AbstractPart]:
+    """Parts in a row, with neighbouring linear ones joined."""
+    links: list[LinearSystem | AbstractPart] = []
+    for linear, group in groupby(parts, lambda part: isinstance(part, AbstractLinear)):
+        neighbours: list[Any] = list(group)
+        links += [_joined(neighbours)] if linear else neighbours
+    return links
+
+
 def _run_linear(system: LinearSystem, time_s: Times, signal: Signal, by_samples: bool = False) -> Signal:
     """Pass a signal through a linear system that was at rest; see `LinearSystem.respond`."""
     values = system.respond(time_s, signal.values, signal.before, signal.hold, by_samples, signal.settling_s)
@@ -166,6 +176,28 @@ def _run_linear(system: LinearSystem, time_s: Times, signal: Signal, by_samples:
         return Signal(values, before, "first", -1 / system.rate_per_s[0, 0])
     # Behind a step even what comes out of an inertia may have a corner.
     return Signal(values, before, "first" if signal.hold == "zero" else "smooth")
+
+
+def run_parts(parts: Sequence[AbstractPart], time_s: Times, signal: Signal, scene: Any = None) -> Signal:
+    """Pass a signal through parts in a row, of which neighbouring linear ones are solved together.
+
+    Parameters
+    ----------
+    parts
+        In their order.
+    time_s
+        Times of the signal's samples, shape `(t,)`, or the one interval between all of them, shape `()`.
+    signal
+        What goes into the first.
+    scene
+        What parts know beside that; see `Scene`.
+    """
+    for link in _links(parts):
+        if isinstance(link, LinearSystem):
+            signal = _run_linear(link, time_s, signal)
+        else:
+            signal = link.run(time_s, signal, scene)
+    return signal
 
 
 def _imaginary(frequency_Hz: Float[Array, "..."]) -> Complex[Array, "..."]:

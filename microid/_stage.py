@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from itertools import groupby
 from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from microid._linear import Hold, LinearSystem, Times
+from microid._linear import Hold, Times
 from microid._param import ParameterInfo, _as_inexact, parameter_table, static
 from microid._part import (
     AbstractHysteresis,
@@ -18,8 +17,7 @@ from microid._part import (
     Scene,
     Signal,
     _imaginary,
-    _joined,
-    _run_linear,
+    run_parts,
 )
 from microid._precision import _full_precision
 from microid._refine import _lines, refined
@@ -147,20 +145,8 @@ class Stage(eqx.Module):
         signal = Signal(voltage, before, self.hold)
         beside = {name: _lines(_as_inexact(values), self.substeps) for name, values in (columns or {}).items()}
         scene = Scene(signal, beside, start.memory)
-        for link in self._links():
-            if isinstance(link, LinearSystem):
-                signal = _run_linear(link, time, signal)
-            else:
-                signal = link.run(time, signal, scene)
+        signal = run_parts(self.parts, time, signal, scene)
         return signal.values[:: self.substeps]
-
-    def _links(self) -> list[LinearSystem | AbstractPart]:
-        """The parts, with neighbouring linear ones joined."""
-        links: list[LinearSystem | AbstractPart] = []
-        for linear, group in groupby(self.parts, lambda part: isinstance(part, AbstractLinear)):
-            parts: list[Any] = list(group)
-            links += [_joined(parts)] if linear else parts
-        return links
 
     def with_substeps(self, substeps: int) -> Self:
         """Return a stage that divides every interval into so many steps."""

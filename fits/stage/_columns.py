@@ -15,7 +15,7 @@ from fits.loop._stepped import intervals
 from fits.stage._chain import Chain
 from fits.stage._plain_linear import Linear
 from fits.stage._run import ahead, joined, lines_of
-from microid import Coordinates, LinearSystem, Scene, Signal, Stage, Staircase
+from microid import Coordinates, LinearSystem, Scene, Signal, Stage, Staircase, run_parts
 
 # Samples that are passed on at a time.
 PIECE = 2048
@@ -74,10 +74,7 @@ def _propagated(
     between = lines_of(ahead(stage, place, samples))
 
     def follow(values: Float[Array, " n"]) -> Float[Array, " n"]:
-        signal = Signal(values, values[0], *between)
-        for part in stage.parts[place + 1 :]:
-            signal = part.run(time_s, signal, scene)
-        return signal.values
+        return run_parts(stage.parts[place + 1 :], time_s, Signal(values, values[0], *between), scene).values
 
     _, push = jax.linearize(follow, around_um)
     return jax.vmap(push)(moved_um)

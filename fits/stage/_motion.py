@@ -15,7 +15,18 @@ from fits.io._record import Record
 from fits.loop._run import Run, prepare_run
 from fits.stage._plain_stage import fine_steps
 from fits.stage._run import as_stage, gain_ahead, place_of_hysteresis, range_of
-from microid import AbstractPart, Driver, Mechanics, Preisach, Scene, Signal, Stage, innermost
+from microid import (
+    AbstractLinear,
+    AbstractPart,
+    Driver,
+    Mechanics,
+    Preisach,
+    Scene,
+    Signal,
+    Stage,
+    innermost,
+    run_parts,
+)
 
 
 @dataclass(frozen=True)
@@ -33,9 +44,9 @@ def prepare(stage: Stage, run: Run) -> Prepared:
 
 
 @kept
-def _through(part: AbstractPart, time_s: Any, signal: Signal, scene: Scene) -> Signal:
-    """Send a signal through one part."""
-    return part.run(time_s, signal, scene)
+def _through(parts: tuple[AbstractPart, ...], time_s: Any, signal: Signal, scene: Scene) -> Signal:
+    """Send a signal through parts in a row."""
+    return run_parts(parts, time_s, signal, scene)
 
 
 def signals(
@@ -48,8 +59,12 @@ def signals(
     pairs = () if like is None else zip(stage.parts, like.parts, strict=False)
     same = sum(1 for _ in takewhile(lambda pair: _is_same(*pair), pairs))
     found = [*known[: same + 1]] or [prepared.scene.command]
-    for part in stage.parts[same:]:
-        found.append(_through(part, prepared.run.samples.time_s, found[-1], prepared.scene))
+    for k in range(same, len(stage.parts)):
+        # Neighbouring linear parts are one system from the first of them on.
+        first = k
+        while first > 0 and all(isinstance(part, AbstractLinear) for part in stage.parts[first - 1 : k + 1]):
+            first -= 1
+        found.append(_through(stage.parts[first : k + 1], prepared.run.samples.time_s, found[first], prepared.scene))
     return found
 
 

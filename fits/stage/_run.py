@@ -184,9 +184,7 @@ def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""]
     """What goes into a part after a rest at the first command, or at another, at the refined times, `(m,)`."""
     signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, samples.hold)
     scene = m.Scene(signal, samples.beside, samples.start.memory)
-    for part in stage.parts[:place]:
-        signal = part.run(samples.time_s, signal, scene)
-    return signal
+    return m.run_parts(stage.parts[:place], samples.time_s, signal, scene)
 
 
 def yields_inside(stage: m.Stage) -> bool:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from microid._linear import Hold, LinearSystem
 from microid._param import _as_inexact
-from microid._part import AbstractHysteresis
+from microid._part import AbstractHysteresis, _links
 from microid._stage import Stage, Start
 from microid.control._hysteresis_step import _step_form
 
@@ -100,7 +100,7 @@ class SampledStage(AbstractPlant):
         hold: Hold = "zero"
         settling_s = None
         names = {id(part): name for name, part in zip(stage.names, stage.parts, strict=True)}
-        for link in stage._links():
+        for link in _links(stage.parts):
             if isinstance(link, LinearSystem):
                 links.append(_LinearStep.of(link, self.interval_s / stage.substeps, hold, settling_s))
                 if link.order:
