@@ -106,10 +106,10 @@ def fit(given: common.Given) -> None:
     common.print_result(given, {"out": given.out, "plots": places, **report}, lines)
 
 
-def _start(given: common.Given) -> "late.Stage":
-    """The stage to fit: that of a model file, or the default one."""
+def _start(given: common.Given) -> "late.Stage | None":
+    """The stage to fit: that of a model file, or the default one; None for that of the fit itself."""
     if given.start is None:
-        return late.default_stage(_HOLDS[given.hold or "lines"])
+        return late.default_stage(_HOLDS[given.hold]) if given.hold else None
     stage = late.load_model(given.start).model
     if not isinstance(stage, late.Stage):
         raise DataError(
