@@ -12,6 +12,7 @@ from fits.diagnosis import _misfit
 from fits.diagnosis._comparison import model_error
 from fits.diagnosis._explanation import Cause, Selection
 from fits.diagnosis._occurrences import has_occurred
+from fits.diagnosis._refit import Refit
 from fits.diagnosis._thresholds import Thresholds
 from microid.effects.dropped_samples import DroppedSamples
 
@@ -31,7 +32,7 @@ def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), un
         errors = np.ones(100) * (1 + sum(name in harmful for name in names)) / (1 + sum(n in helpful for n in names))
         strength_z = [0.5 if name in unsure else 9.0 for name in names]
         even = [name not in uneven for name in names]
-        each = {"strength_z": strength_z.__getitem__, "in_each_run": lambda k, *_: even[k]}
+        each = {"strength_z": strength_z.__getitem__, "in_each_run": lambda which, *_: all(even[k] for k in which)}
         return SimpleNamespace(cost=cost(names), change_um=errors, **each)
 
     def without(found, name):
@@ -143,3 +144,18 @@ def test_a_hysteresis_that_bends_to_anything_needs_the_evidence_of_what_it_is_mi
     thresholds = Thresholds()
     assert model_error("bouc_wen_hysteresis", ["creep"], thresholds) == thresholds.confused_error
     assert model_error("backlash", ["creep"], thresholds) == thresholds.model_error
+
+
+def test_hums_that_each_run_has_of_its_own_are_in_every_run():
+    """Their frequencies differ, and each is fitted by itself."""
+    sd = np.full(2, 0.1)
+
+    def strengths(size, in_both):
+        each = [[(np.array([3.0, 1.0]), sd), (np.zeros(2), sd)], [(np.zeros(2), sd), (size * np.ones(2), sd)]]
+        return SimpleNamespace(_strengths=(each if in_both else each[:1]).__getitem__)
+
+    assert Refit.in_each_run(strengths(2.0, True), [0, 1], 0.3, 4.0)
+    assert not Refit.in_each_run(strengths(0.1, True), [0, 1], 0.3, 4.0)
+    assert not Refit.in_each_run(strengths(2.0, False), [0], 0.3, 4.0)
+    # What a run does not show may be as large as in the other.
+    assert Refit.in_each_run(strengths(2.0, False), [0], 0.3, 8.0)

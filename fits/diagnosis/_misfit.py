@@ -108,9 +108,7 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     card = card_of(name)
     laws = [k for k, cause in enumerate(found.causes) if cause.name == name]
     strength_z = max(map(found.model.strength_z, laws))
-    if card.independent and not all(
-        found.model.in_each_run(k, thresholds.minor_share, thresholds.apart_z) for k in laws
-    ):
+    if card.independent and not found.model.in_each_run(laws, thresholds.minor_share, thresholds.apart_z):
         return -np.inf, name, "it would be in some runs and not in others, and what depends on no command is in all"
     if alone and strength_z >= 1:
         return None

@@ -127,11 +127,11 @@ class Refit:
             return np.inf
         return max(float(np.max(np.abs(here) / np.maximum(sd, 1e-300))) for here, sd in self._strengths(k))
 
-    def in_each_run(self, k: int, part: float, apart_z: float) -> bool:
-        """Whether a law may be at least a part as strong in every run as in that where it is strongest."""
-        each = self._strengths(k)
-        least = part * max(float(np.linalg.norm(here)) for here, _ in each)
-        return all(np.linalg.norm(np.abs(here) + apart_z * sd) >= least for here, sd in each)
+    def in_each_run(self, which: Sequence[int], part: float, apart_z: float) -> bool:
+        """Whether some laws together may be at least a part as strong in every run as where they are strongest."""
+        each = np.concatenate([self._strengths(k) for k in which], axis=-1)
+        least = part * np.max(np.linalg.norm(each[:, 0], axis=1))
+        return bool(np.all(np.linalg.norm(np.abs(each[:, 0]) + apart_z * each[:, 1], axis=1) >= least))
 
     def _strengths(self, k: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Strengths of a law in each run, and their standard deviations."""
