@@ -248,6 +248,12 @@ def test_the_view_of_hum_shows_its_line(rng):
 def test_numbers_have_sensible_digits():
     shown = [number(x) for x in (0.0, 1234.5, 12.345, 0.09996, -0.000123, 2.5e-7, np.nan, 999.96)]
     assert shown == ["0", "1234", "12.3", "0.100", "−0.000123", "2.50 × 10⁻⁷", "–", "1000"]  # noqa: RUF001
+    # However exactly a small number is known, its interval has two ends.
+    assert estimate(ParameterEstimate("a", "s", 1.668e-3, 7e-8, 1.66786e-3, 1.66814e-3)) == (
+        "0.001668000",
+        "7.0 × 10⁻⁸",  # noqa: RUF001
+        "0.001667860 to 0.001668140",
+    )
     assert estimate(ParameterEstimate("a", "1", 12.3456, 0.0234, 12.29, 12.41)) == (
         "12.346",
         "0.023",

@@ -17,6 +17,8 @@ _UNITS = {"um": "µm", "degC": "°C"}
 # What stands for a number that is not known.
 NONE = "\N{EN DASH}"
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+# Digits that are shown at most.
+_MOST_DIGITS = 9
 _MINUS = "\N{MINUS SIGN}"
 _TIMES = "\N{MULTIPLICATION SIGN}"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -66,7 +68,10 @@ def estimate(parameter: ParameterEstimate) -> tuple[str, str, str]:
     sd = parameter.sd
     size = abs(parameter.value) if math.isfinite(parameter.value) else 0.0
     if not (math.isfinite(sd) and sd >= 1e-6) or max(size, sd) >= 1e6:
-        return number(parameter.value, 4), number(sd, 2), f"{number(parameter.lower)} to {number(parameter.upper)}"
+        known = size / sd if 0 < sd < size and math.isfinite(sd) else 1.0
+        digits = min(2 + math.ceil(math.log10(known)), _MOST_DIGITS)
+        ends = " to ".join(number(end, max(digits, 3)) for end in (parameter.lower, parameter.upper))
+        return number(parameter.value, max(digits, 4)), number(sd, 2), ends
     places = max(1 - math.floor(math.log10(sd)), 0)
     lower, upper = (_decimals(end, places) for end in (parameter.lower, parameter.upper))
     return _decimals(parameter.value, places), _decimals(sd, places), f"{lower} to {upper}"
