@@ -191,6 +191,11 @@ def run_parts(parts: Sequence[AbstractPart], time_s: Times, signal: Signal, scen
         What goes into the first.
     scene
         What parts know beside that; see `Scene`.
+
+    Returns
+    -------
+    Signal
+        What comes out of the last, its values of shape `(t,)`, in the unit that it gives.
     """
     for link in _links(parts):
         if isinstance(link, LinearSystem):

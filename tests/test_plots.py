@@ -16,7 +16,8 @@ import microid
 from fits import DataError, FitResult, FitStatus, LevelTrial, Record, RunReport, Uncertainty
 from fits.io._summary import AbstractSummary
 from fits.loop._design import Grid
-from fits.plots._fit import _response, linear_gain
+from fits.loop._run import prepare_run
+from fits.plots._fit import _response, linear_gain, linear_parts, predicted_um
 from fits.plots._results import picture_of
 from fits.plots._style import legend, thinned
 from fits.stage._start import MeasuredResponse
@@ -209,3 +210,32 @@ def test_a_legend_shows_a_dot_that_can_be_seen():
     legend(picture, (axes,))
     assert [line.get_markersize() for line in picture.legends[0].get_lines()] == [2.5, 6]
     plt.close(picture)
+
+
+def test_a_stage_is_drawn_only_where_its_history_is_known(rng, model):
+    """Its free motions, fitted where they have died away, were drawn 70 mm high before."""
+    stage = microid.Stage.of(
+        hysteresis=model, lag=microid.Lag(jnp.asarray(2e-3)), mechanics=microid.Mechanics(150.0, 0.14)
+    )
+    time_s = np.arange(2000) / 1500
+    voltage_V = 50 + np.minimum(time_s, 0.4) * 120 * np.sin(2 * np.pi * 4 * time_s)
+    moved_um = np.asarray(eqx.filter_jit(stage)(jnp.asarray(time_s), jnp.asarray(voltage_V)))
+    run = prepare_run(
+        Record(time_s, voltage_V, moved_um + rng.normal(scale=1e-3, size=2000)), (LOWER_V, UPPER_V), "unknown", 0.0
+    )
+    known = run.known
+    assert 0 < known.sum() < len(known)
+    assert not known[0]
+    drawn = predicted_um(stage, run)
+    assert np.isnan(drawn[~known]).all()
+    np.testing.assert_allclose(drawn[known], run.displacement_um[known], atol=0.1)
+
+
+def test_what_moves_in_a_stage_is_named_as_it_is(model):
+    driver, lag, mechanics = microid.Driver(1e-3), microid.Lag(1e-3), microid.Mechanics(150.0, 0.1)
+    stages = {
+        "driver and mechanics": {"driver": driver, "hysteresis": model, "mechanics": mechanics},
+        "lag and mechanics": {"hysteresis": model, "lag": lag, "mechanics": mechanics},
+        "static gain": {"hysteresis": model, "sensor": microid.Sensor()},
+    }
+    assert [linear_parts(microid.Stage.of(**parts)) for parts in stages.values()] == [*stages]

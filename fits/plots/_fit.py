@@ -253,7 +253,7 @@ def plot_stage(
     noises = [report.noise_um or 0.0 for report in known]
     noises += [max(noises)] * len(aside)
     drawn = [
-        Drawn(run, report, run.displacement_um - residual_of(stage, run), result.uncertainty.sd_um(stage, run), noise)
+        Drawn(run, report, predicted_um(stage, run), result.uncertainty.sd_um(stage, run), noise)
         for run, report, noise in zip(runs, result.runs, noises, strict=True)
     ]
     fitted, predicted = drawn[: len(records)], drawn[len(records) :]
@@ -271,10 +271,29 @@ def plot_stage(
     return style.save_all(pictures, folder, form)
 
 
+def predicted_um(stage: Stage, run: Run) -> np.ndarray:
+    """What a stage predicts of a run, beside its nuisance parameters, in um, shape `(n,)`.
+
+    NaN where the unknown history still counts: how the stage moved before is fitted to what follows, where that has
+    died away, and led back from there it may be anything.
+    """
+    return np.where(run.known, run.displacement_um - residual_of(stage, run), np.nan)
+
+
 def _highest_Hz(measured: MeasuredResponse) -> float:
     """The highest frequency that a run surely shows; that of its last line if it shows none surely."""
     sure = measured.frequency_Hz[measured.coherence > _COHERENT]
     return float((sure if len(sure) else measured.frequency_Hz).max())
+
+
+def linear_parts(stage: Stage) -> str:
+    """Names of the linear parts that move by themselves, in their order, as in "driver and mechanics"."""
+    moving = [
+        name.replace("_", " ")
+        for name, part in zip(stage.names, stage.parts, strict=True)
+        if isinstance(part, AbstractLinear) and part.system().order
+    ]
+    return " and ".join(moving) or "static gain"
 
 
 def linear_gain(stage: Stage, frequency_Hz: np.ndarray) -> np.ndarray:
@@ -304,7 +323,7 @@ def _response(stage: Stage, source: str, measured: MeasuredResponse) -> Figure:
     grey: dict[str, Any] = {"c": shade, "cmap": "gray", "vmin": 0.0, "vmax": 1.0, "s": 8.0, "linewidths": 0.0}
     name = "measured (Welch: peaks are rounded)"
     size.scatter(measured.frequency_Hz, np.abs(measured.response), label=name, **grey)
-    size.loglog(frequency, np.abs(model), label="driver and mechanics", **style.MODEL)
+    size.loglog(frequency, np.abs(model), label=linear_parts(stage), **style.MODEL)
     turn.scatter(measured.frequency_Hz, np.degrees(near), **grey)
     turn.semilogx(frequency, np.degrees(phase), **style.MODEL)
     turn.xaxis.set_major_formatter(LogFormatter())

@@ -17,7 +17,7 @@ from fits.machining._budget import Budget
 from fits.machining._sensitivity import SensitivityReport
 from fits.plots import _style as style
 from fits.plots._diagnosis import residual_figure
-from fits.plots._fit import linear_gain
+from fits.plots._fit import linear_gain, linear_parts
 from fits.plots._machining import budget_bars, tornado
 from fits.stage._checks import speed_Hz
 from microid import Mechanics, Stage
@@ -64,7 +64,7 @@ def _(result: Diagnosis) -> Figure:
 
 @picture_of.register(FitResult)
 def _(result: FitResult[Any]) -> Figure:
-    """Loops of the fitted hysteresis over the slowest run, and of a stage the gain of driver and mechanics."""
+    """Loops of the fitted hysteresis over the slowest run, and of a stage the gain of its linear parts."""
     law, stage = result.hysteresis, result.model if isinstance(result.model, Stage) else None
     width_in, columns = (style.WIDE_in, 2) if stage else (style.NARROW_in, 1)
     picture, grid = style.panels(width_in, 2.8, 1, columns, squeeze=False)
@@ -87,5 +87,5 @@ def _(result: FitResult[Any]) -> Figure:
         resonances = [float(part.natural_frequency_Hz) for part in stage.parts if isinstance(part, Mechanics)]
         frequency_Hz = max(resonances, default=100.0) * np.logspace(-2, 1, 600)
         grid[0, 1].loglog(frequency_Hz, np.abs(linear_gain(stage, frequency_Hz)), **style.MODEL)
-        style.label(grid[0, 1], "frequency (Hz)", "gain over that at rest", "driver and mechanics")
+        style.label(grid[0, 1], "frequency (Hz)", "gain over that at rest", linear_parts(stage))
     return picture
