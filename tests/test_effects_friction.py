@@ -1,7 +1,9 @@
 """Laws of Bouc and Wen as effects, inside the mechanics and of the voltage, against adaptive integration."""
 
+from dataclasses import replace
 from itertools import pairwise
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from _models import random_model
@@ -32,15 +34,20 @@ def test_it_is_that_of_dahl_or_of_bouc_and_wen_on_the_mass(rng, gamma):
         np.testing.assert_allclose(found, truth, atol=0.04 * np.max(np.abs(truth - plain)))
 
 
-@pytest.mark.parametrize(("sigma", "exponent", "asymmetry"), [(1.0, 1.0, 0.0), (0.6, 1.7, -0.1), (0.9, 1.3, 0.12)])
-def test_a_state_of_bouc_and_wen_stays_behind_the_voltage(rng, sigma, exponent, asymmetry):
+@pytest.mark.parametrize(
+    ("sigma", "exponent", "asymmetry", "approach"),
+    [(1.0, 1.0, 0.0, 1.0), (0.6, 1.7, -0.1, 1.0), (0.9, 1.3, 0.12, 1.0), (1.0, 1.0, 0.0, 1.6), (0.8, 1.2, 0.1, 0.8)],
+)
+def test_a_state_of_bouc_and_wen_stays_behind_the_voltage(rng, sigma, exponent, asymmetry, approach):
     hysteresis, voltage = random_model(rng, 8), wander(rng, 300, 10, 90)
     amplitude, length = 2.0, 20.0
-    effect = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 80, sigma, exponent, 80.0, asymmetry)
+    given = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 80, sigma, exponent, 80.0, asymmetry)
+    effect = replace(given, approach=jnp.asarray(approach))
 
     def slope(z, way):
         bent = 1 - sigma + sigma * np.sign(z) * way + asymmetry * (way + np.sign(z))
-        return (1 - abs(z) ** exponent * bent) / length
+        left = 1 - abs(z) ** exponent * bent
+        return np.sign(left) * abs(left) ** approach / length
 
     # Up from the lower end of the range to where the record begins, and along it.
     lower = float(hysteresis.density.lower_V)

@@ -199,11 +199,13 @@ def test_an_effect_of_an_older_file_has_what_came_later_at_rest(tmp_path, rng):
     save_model(path, microid.Stage.of(hysteresis=law), None, {})
     content = json.loads(path.read_text())
     (part,) = content["model"]["parts"]
-    for name in ("gain_first", "gain_second", "gain_third", "gain_fourth", "loss_first", "loss_second", "lower_V"):
+    came_later = "gain_first", "gain_second", "gain_third", "gain_fourth", "loss_first", "loss_second"
+    for name in (*came_later, "lower_V", "approach"):
         del part[name]
     path.write_text(json.dumps(hashed(content)))
     effect = load_model(path).model.parts[0]
     assert float(effect.gain_first) == 0.0
+    assert float(effect.approach) == 1.0
     assert float(effect.sigma) == 0.8
     del part["sigma"]
     path.write_text(json.dumps(hashed(content)))

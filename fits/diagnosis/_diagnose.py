@@ -15,6 +15,7 @@ from fits.diagnosis._explanation import Selection
 from fits.diagnosis._prepare import Prepared, Reading, prepare_diagnosis
 from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._result import Diagnosis, Step
+from fits.diagnosis._second_look import look_again, predicts_better
 from fits.diagnosis._select import select
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._errors import DataError
@@ -27,8 +28,8 @@ from microid.effects import card_of
 
 # Where whole runs are held out, this part of the others is still kept aside, to check what is found.
 _CHECK = 0.12
-# Parts of the budget after which the stage is not fitted in yet another way before effects are asked for, no more are
-# asked for as what was found is refined in the rest, and intervals of what was found are not followed.
+# Parts of the budget after which the stage is not fitted in yet another way, no more effects are asked for as what
+# was found is refined in the rest, and intervals of what was found are not followed.
 _PREPARED, _ASKED, _REFINED = 0.5, 0.65, 0.85
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
@@ -142,17 +143,24 @@ def diagnose(
 
     has_time = before(_ASKED)
 
-    def selected(reading: Reading, onward: Problem | None = None) -> tuple[Prepared, Selection]:
-        ready = prepare_diagnosis(reading, progress, before(_PREPARED), onward)
+    def chosen(ready: Prepared) -> Selection:
         progress(Step.SELECTION)
         stage = ready.bench, ready.projector, ready.probes
-        return ready, select(*stage, false_alarm, rng, progress, thresholds, has_time)
+        return select(*stage, false_alarm, rng, progress, thresholds, has_time)
+
+    def selected(reading: Reading, onward: Problem | None = None) -> tuple[Prepared, Selection]:
+        ready = prepare_diagnosis(reading, progress, before(_PREPARED), onward)
+        return ready, chosen(ready)
 
     def answer(reading: Reading, *remarks: str) -> Diagnosis:
         ready, found = selected(reading)
         if (better := found.plain_instead(thresholds)) is not None and has_time():
             progress("fitting the plain stage again, from where it has gone beside an effect that explains little")
             ready, found = selected(reading, better)
+        elif (other := look_again(ready, found, progress, before(_PREPARED))) is not None:
+            afresh = chosen(other)
+            if predicts_better(found, afresh, thresholds.worse_z):
+                ready, found = other, afresh
         remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
         ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
         request = Request(duration_s, limits, margin, has_time) if has_time() else None
@@ -170,6 +178,6 @@ def diagnose(
         if max((cause.z for cause in whole.causes), default=0.0) > thresholds.strong_z:
             return whole
     off, said = gain.heldout_rms_after_um**2 / heard_um2, _UNKNOWN if aside else _UNSEEN
-    if off > _UNLIKE and (diagnosis.verdict == "no_effect" or not (aside or diagnosis.unexplained_rms_um > 0)):
+    if off > _UNLIKE and not diagnosis.unexplained_rms_um > 0:
         diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, said.format(off**0.5)))
     return diagnosis

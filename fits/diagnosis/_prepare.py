@@ -115,25 +115,46 @@ def prepare_diagnosis(
     The stage is fitted again, its command in another way between samples, only where it still `has_time`. The first
     fit goes `onward` from one that was made.
     """
-    records, initial, fraction = reading.records, reading.initial, reading.fraction
+    return prepared(*decide_plain_stage(reading, progress, has_time, onward), progress)
+
+
+def fit_plain_stage(
+    reading: Reading, holds: Holds, progress: Callable[[str], None], onward: Problem | None = None
+) -> PlainFit:
+    """Fit the plain stage with commands that go between samples in one way, and what is wrong with single samples."""
+    records = reading.records
+    settings = reading.aside, reading.fraction, reading.initial, progress, holds, reading.thresholds.model_error
+    regression = regress(fit_baseline(records, *settings, onward))
+    faults = find_faults(regression, None, reading.thresholds)
+    if not faults.repaired:
+        return PlainFit(regression, faults, reading.thresholds)
+    progress("fitting the plain stage again, without single bad samples")
+    # Where an effect passes for bad samples, what runs show no poles of they show none of without these.
+    left_out = () if regression.baseline.dynamic else regression.baseline.remarks
+    regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem, left_out))
+    found = find_faults(regression, None, reading.thresholds)
+    found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
+    return PlainFit(regression, found, reading.thresholds)
+
+
+def decide_plain_stage(
+    reading: Reading,
+    progress: Callable[[str], None],
+    has_time: Callable[[], bool] = lambda: True,
+    onward: Problem | None = None,
+) -> tuple[Reading, PlainFit, tuple[str, ...]]:
+    """Fit the plain stage, find which parts it has and how its command goes between samples, and what to say of it.
+
+    The reading that comes back holds nothing out where no fit would predict that.
+    """
+    records = reading.records
     said: tuple[str, ...] = ()
-    if fraction > 0 and not _covered(records, fraction) and _covered(records, 0.0):
-        fraction, said = 0.0, (*said, ONE_WAY)
-    said = (*said, *_beyond(records, reading.aside, fraction))
+    if reading.fraction > 0 and not _covered(records, reading.fraction) and _covered(records, 0.0):
+        reading, said = replace(reading, fraction=0.0), (*said, ONE_WAY)
+    said = (*said, *_beyond(records, reading.aside, reading.fraction))
 
     def fitted(holds: Holds, onward: Problem | None = None) -> PlainFit:
-        settings = reading.aside, fraction, initial, progress, holds, reading.thresholds.model_error
-        regression = regress(fit_baseline(records, *settings, onward))
-        faults = find_faults(regression, None, reading.thresholds)
-        if not faults.repaired:
-            return PlainFit(regression, faults, reading.thresholds)
-        progress("fitting the plain stage again, without single bad samples")
-        # Where an effect passes for bad samples, what runs show no poles of they show none of without these.
-        left_out = () if regression.baseline.dynamic else regression.baseline.remarks
-        regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem, left_out))
-        found = find_faults(regression, None, reading.thresholds)
-        found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
-        return PlainFit(regression, found, reading.thresholds)
+        return fit_plain_stage(reading, holds, progress, onward)
 
     def lagging(here: PlainFit, holds: Holds) -> tuple[PlainFit, str]:
         """A stage with a driver and no mechanics in place of another, where that explains more, and what to say."""
@@ -190,6 +211,12 @@ def prepare_diagnosis(
             words = _DRIVER.format(float(driver.time_constant_s))
         said = (*said, *_of_holds(here.regression.baseline))
     said = (*said, *filter(None, [words]))
+    return reading, here, said
+
+
+def prepared(reading: Reading, here: PlainFit, said: tuple[str, ...], progress: Callable[[str], None]) -> Prepared:
+    """What is asked beside a plain stage, and what is `said` of that."""
+    records = reading.records
     if here.regression.baseline.dynamic:
         drop, late_s = here.late()
         if (
@@ -211,7 +238,7 @@ def prepare_diagnosis(
     # Where a run passes each voltage one way only, a rough density looks like any effect.
     rough = (ROUGHEST,) * len(regression.finer) if ONE_WAY in said else learn_roughness(here.projector, candidates)
     # What is large and has been used makes room.
-    del here
+    here.projector.release()
     drop_programs(records)
     projector = Projector(regression, faults.noise, rough).bounded()
     projector = projector.beside(with_discrepancy(projector, candidates)).bounded()

@@ -28,15 +28,16 @@ class BoucWenHysteresis(AbstractEffect):
     r"""A hysteresis beside whose displacement `w` a state of Bouc and Wen stays behind the voltage: `w - a z`.
 
     .. math::
-        l \frac{dz}{du} = g(u) - p(u) |z|^n \left(1 - \sigma + \sigma\, \mathrm{sgn}(z \dot u)
-        + \phi\, (\mathrm{sgn}\, \dot u + \mathrm{sgn}\, z)\right)
+        l \frac{dz}{du} = g(u) \left(1 - \frac{p(u)}{g(u)} |z|^n \left(1 - \sigma
+        + \sigma\, \mathrm{sgn}(z \dot u) + \phi\, (\mathrm{sgn}\, \dot u + \mathrm{sgn}\, z)\right)\right)^i
 
     It forgets reversals by and by, where a Preisach operator wipes them out or keeps them: its minor loops do not
     close, and those between the same voltages differ. The logarithms of gain and loss, `g` and `p`, are sums of
-    Legendre's polynomials over the range of the voltage. With `sigma` and `n` of one it is Dahl's law, and with a
-    gain that varies that of Coleman and Hodgdon, whose curves are not straight; with a `sigma` of a half it is that
-    of Jiles and Atherton without coupling. Before the record the voltage went along what the memory of a `Preisach`
-    holds, from where it had come down for long; ahead of another law it had just done so.
+    Legendre's polynomials over the range of the voltage. With an `i` of one it is Bouc and Wen's law. With `sigma`
+    and `n` of one it is Dahl's, whose exponent is `i`, and with a gain that varies that of Coleman and Hodgdon, whose
+    curves are not straight; with a `sigma` of a half it is that of Jiles and Atherton without coupling. Before the
+    record the voltage went along what the memory of a `Preisach` holds, from where it had come down for long; ahead
+    of another law it had just done so.
 
     Attributes
     ----------
@@ -63,6 +64,8 @@ class BoucWenHysteresis(AbstractEffect):
         Of those in that of the loss: the part turns sooner where that is larger.
     lower_V
         Where the range begins, given.
+    approach
+        `i`: above one it comes to its limits ever more slowly, below one it reaches them.
     """
 
     name: ClassVar[str] = "bouc_wen_hysteresis"
@@ -100,6 +103,7 @@ class BoucWenHysteresis(AbstractEffect):
     loss_first: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
     loss_second: Float[Array, ""] = param(unit="1", scale=0.1, lower=-_VARIED, upper=_VARIED, default=0.0)
     lower_V: Float[Array, ""] = array(default=0.0)
+    approach: Float[Array, ""] = param(unit="1", lower=0.5, upper=3.0, default=1.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -152,7 +156,11 @@ class BoucWenHysteresis(AbstractEffect):
             # The logarithm has no derivative at zero, where the power has.
             at_zero = size < _SMALL
             power = jnp.where(at_zero, 0.0, jnp.exp(self.exponent * jnp.log(jnp.where(at_zero, 1.0, size))))
-            return gain - loss * power * (1 - self.sigma + self.sigma * side * way + self.asymmetry * (way + side))
+            turn = 1 - self.sigma + self.sigma * side * way + self.asymmetry * (way + side)
+            left = 1 - loss / gain * power * turn
+            # Where the limit varies with the voltage, it may be passed, and is then approached from beyond.
+            size = jnp.maximum(jnp.abs(left), _SMALL)
+            return gain * jnp.sign(left) * jnp.exp(self.approach * jnp.log(size))
 
         def visit(z: Array, move: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             move_V, *varied = move

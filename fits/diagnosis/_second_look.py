@@ -1,0 +1,86 @@
+"""The parts of the plain stage, asked for again beside the cause that hid them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from fits.diagnosis._effects import Bench
+from fits.diagnosis._explanation import Selection
+from fits.diagnosis._extension import shared_effects
+from fits.diagnosis._noise import find_faults
+from fits.diagnosis._plain_fit import PlainFit
+from fits.diagnosis._prepare import Prepared, Reading, decide_plain_stage, fit_plain_stage, prepared
+from fits.diagnosis._refit import refit
+from fits.io._record import Record
+from fits.stats._compare import improvement_z
+
+
+def look_again(
+    ready: Prepared, found: Selection, progress: Callable[[str], None], has_time: Callable[[], bool]
+) -> Prepared | None:
+    """Fit the plain stage with the parts, and the command, that the records show without their largest cause.
+
+    Beside a cause that is many times what a resonance makes, a plain stage shows none, nor how its command goes
+    between samples. None where the records show the same as before, or no cause explains most of the misfit.
+    """
+    cleaned = without_largest(ready, found)
+    if cleaned is None or not has_time():
+        return None
+    progress("fitting the plain stage again, to what the largest cause leaves")
+    cleaned, there, said = decide_plain_stage(cleaned, progress, has_time)
+    if _structure(there) == _structure_of(ready) or not has_time():
+        return None
+    reading = replace(ready.reading, fraction=cleaned.fraction)
+    here = fit_plain_stage(reading, there.holds, progress, there.regression.baseline.problem)
+    return prepared(reading, here, said, progress) if _structure(here) == _structure(there) else None
+
+
+def predicts_better(found: Selection, other: Selection, least_z: float) -> bool:
+    """Whether another selection predicts what was held out of the runs better, by so many standard deviations."""
+    same = found.projector.beside(other.projector.noise)
+    before, after = same.held_out(found.model.change_um), other.projector.held_out(other.model.change_um)
+    return improvement_z(before, after) > least_z
+
+
+def without_largest(ready: Prepared, found: Selection) -> Reading | None:
+    """The records without what the cause that was found first makes of them.
+
+    None where it explains less than most of the misfit, or leaves nothing but noise. A narrow band may be what the
+    plain stage lacks.
+    """
+    thresholds, model, projector = ready.reading.thresholds, found.model, found.projector
+    if not found.causes:
+        return None
+    beside = find_faults(projector.regression, model.change_um, thresholds)
+    if model.is_noise(projector, thresholds.chance_z) and not beside.is_narrow(thresholds):
+        return None
+    name = found.causes[0].name
+    laws = [k for k, law in enumerate(model.laws) if law.form.name == name]
+    # Others may stand in for what the plain stage lacks.
+    alone = refit(found.bench, projector, [model.laws[k] for k in laws], [model.x[k] for k in laws], 4)
+    misfit = found.plain.cost - projector.count + projector.freedom
+    if found.plain.cost - alone.cost < (1 - thresholds.minor_share) * misfit:
+        return None
+    behind, effects = Bench(found.bench.baseline, aside=True), shared_effects(alone, len(alone.change_um))
+    aside_um = [behind.respond_in(k, effects) - plain for k, plain in enumerate(behind.plain)]
+
+    def cleaned(record: Record, change_um: np.ndarray) -> Record:
+        assert record.displacement_um is not None
+        return replace(record, displacement_um=record.displacement_um - change_um)
+
+    reading = ready.reading
+    return replace(
+        reading,
+        records=list(map(cleaned, reading.records, alone.change_um)),
+        aside=list(map(cleaned, reading.aside, aside_um)),
+    )
+
+
+def _structure(fit: PlainFit) -> tuple[object, ...]:
+    return tuple(type(part) for part in fit.regression.baseline.stage.parts), fit.holds
+
+
+def _structure_of(ready: Prepared) -> tuple[object, ...]:
+    baseline = ready.baseline
+    return tuple(type(part) for part in baseline.stage.parts), tuple(run.hold for run in baseline.runs)
