@@ -1,6 +1,6 @@
 """Hysteresis that is no Preisach operator: a part of it follows the law of Bouc and Wen."""
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import jax.numpy as jnp
 from jax import lax
@@ -14,9 +14,11 @@ from microid.effects._base import AbstractEffect, Place, Scales, register
 from microid.effects._grids import _decades
 from microid.effects._legendre import _legendre
 
-# Steps of the classical Runge-Kutta rule per sample, and per move before the record.
-_SUBSTEPS, _PAST_SUBSTEPS = 2, 32
+# A move of the voltage longer than this part of the length is divided into so many steps of the classical Runge-Kutta
+# rule; any other is one.
+_LONG, _FINE = 0.1, 16
 _SMALL = 1e-12
+Moves: TypeAlias = tuple[Array, Array, Array, Array]
 # Each polynomial is at most so much of the logarithm of gain or loss.
 _VARIED = 3.0
 # So many places in the range at which the farthest limit of the state is looked for.
@@ -123,9 +125,9 @@ class BoucWenHysteresis(AbstractEffect):
         if isinstance(law, Preisach):
             memory = start.memory if isinstance(start, Scene) else start
             past = law.density.lower_V[None] if memory is None else memory.extremes_V
-            state = self._along(state, jnp.append(past, signal.before), _PAST_SUBSTEPS)[-1]
+            state = self._along(state, jnp.append(past, signal.before))[-1]
         state = jnp.clip(state + self.before, self._limit(-1.0), self._limit(1.0))
-        states = self._along(state, jnp.concatenate([signal.before[None], signal.values]), _SUBSTEPS)
+        states = self._along(state, jnp.concatenate([signal.before[None], signal.values]))
         return given.with_values(given.values - self.amplitude_um * states, given.before - self.amplitude_um * state)
 
     def _limit(self, way: float) -> Float[Array, ""]:
@@ -139,15 +141,13 @@ class BoucWenHysteresis(AbstractEffect):
         gain = _legendre(place, (self.gain_first, self.gain_second, self.gain_third, self.gain_fourth))
         return jnp.exp(gain), jnp.exp(_legendre(place, (self.loss_first, self.loss_second)))
 
-    def _along(self, state: Float[Array, ""], voltage_V: Float[Array, " t"], substeps: int) -> Float[Array, " t-1"]:
+    def _along(self, state: Float[Array, ""], voltage_V: Float[Array, " t"]) -> Float[Array, " t-1"]:
         """The state at all voltages but the first, at which it is given."""
         lowest, highest = self._limit(-1.0), self._limit(1.0)
         places = jnp.clip(2 * (voltage_V - self.lower_V) / self.range_V - 1, -1, 1)
+        move_V = jnp.diff(voltage_V)
         # At the ends and in the middle of each step, all at once: in the loop they would take most of the time.
-        whole = jnp.linspace(0, 1, 2 * substeps + 1, dtype=places.dtype)
-        shares = jnp.stack([whole[:-2:2], whole[1::2], whole[2::2]], axis=1)
-        first, way = places[:-1, None, None], jnp.diff(places)[:, None, None]
-        gain, loss = self._varied(first + way * shares[None])
+        three = jnp.stack([places[:-1], (places[:-1] + places[1:]) / 2, places[1:]], axis=1)
 
         def slope(z: Array, way: Array, gain: Array, loss: Array) -> Array:
             # Within the limits it never goes back, however long a step is.
@@ -162,19 +162,39 @@ class BoucWenHysteresis(AbstractEffect):
             size = jnp.maximum(jnp.abs(left), _SMALL)
             return gain * jnp.sign(left) * jnp.exp(self.approach * jnp.log(size))
 
-        def visit(z: Array, move: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            move_V, *varied = move
-            step, way = move_V / (self.length_share * self.range_V * substeps), jnp.sign(move_V)
+        def step(z: Array, step: Array, gain: Array, loss: Array) -> Array:
+            way = jnp.sign(step)
+            k1 = slope(z, way, gain[0], loss[0])
+            k2 = slope(z + step * k1 / 2, way, gain[1], loss[1])
+            k3 = slope(z + step * k2 / 2, way, gain[1], loss[1])
+            k4 = slope(z + step * k3, way, gain[2], loss[2])
+            return jnp.clip(z + step * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest)
 
-            def go(z: Array, here: list[Array]) -> tuple[Array, None]:
-                gain, loss = here
-                k1 = slope(z, way, gain[0], loss[0])
-                k2 = slope(z + step * k1 / 2, way, gain[1], loss[1])
-                k3 = slope(z + step * k2 / 2, way, gain[1], loss[1])
-                k4 = slope(z + step * k3, way, gain[2], loss[2])
-                return jnp.clip(z + step * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest), None
+        def in_steps(z: Array, length: Array, gain: Array, loss: Array, ends: Array) -> Array:
+            whole = jnp.linspace(ends[0], ends[1], 2 * _FINE + 1)
+            each = self._varied(jnp.stack([whole[:-2:2], whole[1::2], whole[2::2]], axis=1))
 
-            z, _ = lax.scan(go, z, varied, unroll=min(substeps, _SUBSTEPS))
+            def go(z: Array, varied: tuple[Array, Array]) -> tuple[Array, None]:
+                return step(z, length / _FINE, *varied), None
+
+            return lax.scan(go, z, each)[0]
+
+        def at_once(z: Array, length: Array, gain: Array, loss: Array, ends: Array) -> Array:
+            return step(z, length, gain, loss)
+
+        def visit(z: Array, move: Moves) -> tuple[Array, Array]:
+            z = at_once(z, *move)
             return z, z
 
-        return lax.scan(visit, state, (jnp.diff(voltage_V), gain, loss))[1]
+        def visit_any(z: Array, move: Moves) -> tuple[Array, Array]:
+            z = lax.cond(jnp.abs(move[0]) > _LONG, in_steps, at_once, z, *move)
+            return z, z
+
+        ends = jnp.stack([places[:-1], places[1:]], axis=1)
+        moves = move_V / (self.length_share * self.range_V), *self._varied(three), ends
+        # To ask at each move takes as long as to make it.
+        return lax.cond(
+            jnp.any(jnp.abs(moves[0]) > _LONG),
+            lambda: lax.scan(visit_any, state, moves)[1],
+            lambda: lax.scan(visit, state, moves)[1],
+        )
