@@ -184,7 +184,7 @@ class Answer:
 @pytest.fixture
 def asked(monkeypatch):
     """How records were read, in order; the answers are made by hand."""
-    log = SimpleNamespace(readings=[], answers=[], places=[], onward=[])
+    log = SimpleNamespace(readings=[], answers=[], places=[], onward=[], second=None, better=False)
 
     def prepare(reading, progress, has_time, onward):
         log.readings.append(reading)
@@ -204,11 +204,14 @@ def asked(monkeypatch):
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
     found = SimpleNamespace(plain_instead=lambda _: log.places.pop(0) if log.places else None)
     monkeypatch.setattr(_diagnose, "select", lambda *_: found)
+    monkeypatch.setattr(_diagnose, "look_again", lambda *_: log.second)
+    monkeypatch.setattr(_diagnose, "is_better", lambda *_: log.better)
     monkeypatch.setattr(_diagnose, "conclude", conclude)
     record = Record(np.arange(5.0), np.arange(5.0), np.zeros(5))
 
-    def ask(*answers, places=(), **options):
+    def ask(*answers, places=(), second=None, better=False, **options):
         log.answers, log.readings, log.places, log.onward = list(answers), [], list(places), []
+        log.second, log.better = second, better
         found = fits.diagnose([record], **options)
         assert len(log.readings) == len(answers)
         assert log.onward == [None, *places, *[None] * len(answers)][: len(answers)]
@@ -229,6 +232,14 @@ def test_a_plain_stage_that_was_found_beside_an_effect_of_none_is_gone_on_from(a
     _, kept, (first, again) = asked({}, {"z": (9.0,)}, places=["there"])
     assert kept == {"z": (9.0,)}
     assert first is again
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_parts_that_show_beside_a_cause_are_taken_where_those_explain_more(asked, better):
+    baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("with a resonance",))
+    second = Prepared(None, baseline, None, None, None, (), None, ())
+    found, *_ = asked({"z": (9.0,)}, second=second, better=better)
+    assert found.remarks == (("with a resonance",) if better else ("said",))
 
 
 @pytest.mark.parametrize("z", [20.0, 5.0])

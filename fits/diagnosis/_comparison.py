@@ -105,7 +105,8 @@ def compare_rivals(
         if not (stands_out or improvement_z(before, projector.held_out(found.change_um)) >= thresholds.worse_z):
             continue
         most = first + laws if has_time() else 0
-        found = add_occurrences(bench, projector, found, scores, most, thresholds)
+        enough = least + _NEAR * max(model.cost - least, 0.0)
+        found = add_occurrences(bench, projector, model, found, scores, most, enough, thresholds)
         if one.form not in fitted or found.criterion(projector.count) < fitted[one.form].criterion(projector.count):
             fitted[one.form] = found
     rivals = [Rival.of(projector, one) for one in fitted.values()]

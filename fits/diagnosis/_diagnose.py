@@ -15,7 +15,7 @@ from fits.diagnosis._explanation import Selection
 from fits.diagnosis._prepare import Prepared, Reading, prepare_diagnosis
 from fits.diagnosis._records import excerpts, joined
 from fits.diagnosis._result import Diagnosis, Step
-from fits.diagnosis._second_look import look_again, predicts_better
+from fits.diagnosis._second_look import is_better, look_again
 from fits.diagnosis._select import select
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._errors import DataError
@@ -159,7 +159,7 @@ def diagnose(
             ready, found = selected(reading, better)
         elif (other := look_again(ready, found, progress, before(_PREPARED))) is not None:
             afresh = chosen(other)
-            if predicts_better(found, afresh, thresholds.worse_z):
+            if is_better(found, afresh, thresholds):
                 ready, found = other, afresh
         remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
         ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))

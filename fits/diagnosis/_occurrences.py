@@ -67,19 +67,29 @@ def is_abrupt(bench: Bench, projector: Projector, model: Refit, thresholds: Thre
 
 
 def add_occurrences(
-    bench: Bench, projector: Projector, found: Refit, scored: Sequence[Scored], most: int, thresholds: Thresholds
+    bench: Bench,
+    projector: Projector,
+    model: Refit,
+    found: Refit,
+    scored: Sequence[Scored],
+    most: int,
+    enough: float,
+    thresholds: Thresholds,
 ) -> Refit:
     """Add occurrences of what happens at an instant while that pays, so that there are so many laws at most.
 
     Several losses look like a drift, which has to be told from them. Of what jumps one is added for each other run:
     many jumps follow anything, and more are asked for beside other effects. `scored` are all of these: where another
-    explains more of the rest than one more jump, that is asked first.
+    explains more of the rest than one more jump, that is asked first. None is added where all that may be, each
+    explaining as much as the last, would leave more than is `enough`; the `model` is without any.
     """
-    first, form = len(found.laws) - 1, found.laws[-1].form
+    first, form, gain = len(found.laws) - 1, found.laws[-1].form, model.cost - found.cost
     own = [one for one in scored if one.name == form.name]
     if not form.counted:
         most = min(most, first + len(bench.prepared))
     while is_occurrence(found.laws[-1]) and len(found.laws) < most:
+        if found.cost - gain * (most - len(found.laws)) > enough:
+            break
         asked = [one.probe for one in (own if form.counted else scored)]
         best = max(score(projector, asked, found.residual, found.basis()).each, key=lambda one: one.z)
         if best.name != form.name:
@@ -96,7 +106,8 @@ def add_occurrences(
             laws, x = ([*one[:first], *one[first + 1 :]] for one in (more.laws, more.x))
             moved = _one_more(bench, projector, refit(bench, projector, laws, x, 4), own)
             more = min(more, moved, key=lambda one: one.cost)
-        found = relocate(bench, projector, more, first) if form.counted else more
+        more = relocate(bench, projector, more, first) if form.counted else more
+        found, gain = more, found.cost - more.cost
     return found
 
 

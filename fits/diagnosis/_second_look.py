@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fits.diagnosis._comparison import criterion
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Selection
 from fits.diagnosis._extension import shared_effects
@@ -12,8 +13,8 @@ from fits.diagnosis._noise import find_faults
 from fits.diagnosis._plain_fit import PlainFit
 from fits.diagnosis._prepare import Prepared, Reading, decide_plain_stage, fit_plain_stage, prepared
 from fits.diagnosis._refit import refit
+from fits.diagnosis._thresholds import Thresholds
 from fits.io._record import Record
-from fits.stats._compare import improvement_z
 
 
 def look_again(
@@ -36,11 +37,11 @@ def look_again(
     return prepared(reading, here, said, progress) if _structure(here) == _structure(there) else None
 
 
-def predicts_better(found: Selection, other: Selection, least_z: float) -> bool:
-    """Whether another selection predicts what was held out of the runs better, by so many standard deviations."""
-    same = found.projector.beside(other.projector.noise)
-    before, after = same.held_out(found.model.change_um), other.projector.held_out(other.model.change_um)
-    return improvement_z(before, after) > least_z
+def is_better(found: Selection, other: Selection, thresholds: Thresholds) -> bool:
+    """Whether another selection, beside another plain stage, explains and predicts the runs better."""
+    same, model = found.projector.beside(other.projector.noise), found.model
+    there = refit(found.bench, same, model.laws, model.x, 0)
+    return criterion(other.projector, other.model) < criterion(same, there) - thresholds.tie
 
 
 def without_largest(ready: Prepared, found: Selection) -> Reading | None:
