@@ -238,7 +238,7 @@ def test_a_plain_stage_that_was_found_beside_an_effect_of_none_is_gone_on_from(a
 def test_parts_that_show_beside_a_cause_are_taken_where_those_explain_more(asked, better):
     baseline = fits.diagnosis._baseline.Baseline(*(None,) * 14, True, ("with a resonance",))
     second = Prepared(None, baseline, None, None, None, (), None, ())
-    found, *_ = asked({"z": (9.0,)}, second=second, better=better)
+    found, *_ = asked({"z": (9.0,)}, second=(second, second), better=better)
     assert found.remarks == (("with a resonance",) if better else ("said",))
 
 

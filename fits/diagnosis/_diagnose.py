@@ -157,10 +157,11 @@ def diagnose(
         if (better := found.plain_instead(thresholds)) is not None and has_time():
             progress("fitting the plain stage again, from where it has gone beside an effect that explains little")
             ready, found = selected(reading, better)
-        elif (other := look_again(ready, found, progress, before(_PREPARED))) is not None:
-            afresh = chosen(other)
-            if is_better(found, afresh, thresholds):
-                ready, found = other, afresh
+        elif (again := look_again(ready, found, progress, before(_PREPARED))) is not None:
+            plain, beside = again
+            other = chosen(beside)
+            if is_better(found, other, thresholds):
+                ready, found = plain, other
         remarks = (*shortened, *also, *ready.baseline.remarks, *remarks)
         ready = replace(ready, baseline=replace(ready.baseline, remarks=remarks))
         request = Request(duration_s, limits, margin, has_time) if has_time() else None

@@ -119,11 +119,20 @@ def prepare_diagnosis(
 
 
 def fit_plain_stage(
-    reading: Reading, holds: Holds, progress: Callable[[str], None], onward: Problem | None = None
+    reading: Reading,
+    holds: Holds,
+    progress: Callable[[str], None],
+    onward: Problem | None = None,
+    known: Faults | None = None,
 ) -> PlainFit:
-    """Fit the plain stage with commands that go between samples in one way, and what is wrong with single samples."""
+    """Fit the plain stage with commands that go between samples in one way, and what is wrong with single samples.
+
+    Nothing is looked for where that is `known`.
+    """
     records = reading.records
     settings = reading.aside, reading.fraction, reading.initial, progress, holds, reading.thresholds.model_error
+    if known is not None:
+        return PlainFit(regress(fit_baseline(known.clean(records), *settings, onward)), known, reading.thresholds)
     regression = regress(fit_baseline(records, *settings, onward))
     faults = find_faults(regression, None, reading.thresholds)
     if not faults.repaired:

@@ -5,36 +5,46 @@ from dataclasses import replace
 
 import numpy as np
 
+from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._comparison import criterion
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Selection
 from fits.diagnosis._extension import shared_effects
 from fits.diagnosis._noise import find_faults
-from fits.diagnosis._plain_fit import PlainFit
 from fits.diagnosis._prepare import Prepared, Reading, decide_plain_stage, fit_plain_stage, prepared
 from fits.diagnosis._refit import refit
+from fits.diagnosis._regression import regress
 from fits.diagnosis._thresholds import Thresholds
 from fits.io._record import Record
 
 
 def look_again(
     ready: Prepared, found: Selection, progress: Callable[[str], None], has_time: Callable[[], bool]
-) -> Prepared | None:
+) -> tuple[Prepared, Prepared] | None:
     """Fit the plain stage with the parts, and the command, that the records show without their largest cause.
 
     Beside a cause that is many times what a resonance makes, a plain stage shows none, nor how its command goes
-    between samples. None where the records show the same as before, or no cause explains most of the misfit.
+    between samples. What comes first is that plain stage, and second where it belongs beside the cause, from where
+    effects are asked for: a fit without any may end too far from there. None where the records show the same parts
+    as before, or no cause explains most of the misfit.
     """
     cleaned = without_largest(ready, found)
     if cleaned is None or not has_time():
         return None
     progress("fitting the plain stage again, to what the largest cause leaves")
     cleaned, there, said = decide_plain_stage(cleaned, progress, has_time)
-    if _structure(there) == _structure_of(ready) or not has_time():
+    if _structure(there.regression.baseline) == _structure(ready.baseline) or not has_time():
         return None
     reading = replace(ready.reading, fraction=cleaned.fraction)
-    here = fit_plain_stage(reading, there.holds, progress, there.regression.baseline.problem)
-    return prepared(reading, here, said, progress) if _structure(here) == _structure(there) else None
+    plain = fit_plain_stage(reading, there.holds, progress, there.regression.baseline.problem, there.faults)
+    baseline, beside = plain.regression.baseline, there.regression.baseline
+    if _structure(baseline) != _structure(beside) or len(baseline.columns_um) != len(beside.columns_um):
+        return None
+    z = np.asarray(baseline.chain.coordinates.of(beside.stage))
+    moved = replace(baseline, z=z, columns_um=beside.columns_um, prior=beside.prior, hyper=beside.hyper)
+    second = prepared(reading, replace(plain, regression=regress(moved)), said, progress)
+    baseline = replace(baseline, remarks=second.baseline.remarks)
+    return replace(second, baseline=baseline, regression=plain.regression, bench=plain.bench), second
 
 
 def is_better(found: Selection, other: Selection, thresholds: Thresholds) -> bool:
@@ -78,10 +88,6 @@ def without_largest(ready: Prepared, found: Selection) -> Reading | None:
     )
 
 
-def _structure(fit: PlainFit) -> tuple[object, ...]:
-    return tuple(type(part) for part in fit.regression.baseline.stage.parts), fit.holds
-
-
-def _structure_of(ready: Prepared) -> tuple[object, ...]:
-    baseline = ready.baseline
+def _structure(baseline: Baseline) -> tuple[object, ...]:
+    """Which parts a plain stage has, and how its command goes between the samples of each run."""
     return tuple(type(part) for part in baseline.stage.parts), tuple(run.hold for run in baseline.runs)
