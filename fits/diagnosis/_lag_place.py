@@ -71,8 +71,13 @@ def is_of_driver(driver: PlainFit, plain: PlainFit, thresholds: Thresholds) -> b
 
 def _is_damped(plain: PlainFit) -> bool:
     """Whether a mode of the stage does not ring."""
+    return plain.regression.baseline.resonance_Hz is not None and not rings(plain)
+
+
+def rings(plain: PlainFit) -> bool:
+    """Whether the stage has a mode, and that rings."""
     modes = named_parts(plain.regression.baseline.stage, Mechanics)
-    return any(float(mode.damping_ratio) > _RINGS for _, mode in modes)
+    return bool(modes) and all(float(mode.damping_ratio) <= _RINGS for _, mode in modes)
 
 
 def _beside_lags(plain: PlainFit) -> list[Refit]:

@@ -1,15 +1,15 @@
-"""The parts of the plain stage, asked for again beside the cause that hid them."""
+"""The resonance of the plain stage, asked for again beside the cause that hid it."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._comparison import criterion
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Selection
 from fits.diagnosis._extension import shared_effects
+from fits.diagnosis._lag_place import rings
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._prepare import Prepared, Reading, decide_plain_stage, fit_plain_stage, prepared
 from fits.diagnosis._refit import refit
@@ -21,24 +21,26 @@ from fits.io._record import Record
 def look_again(
     ready: Prepared, found: Selection, progress: Callable[[str], None], has_time: Callable[[], bool]
 ) -> tuple[Prepared, Prepared] | None:
-    """Fit the plain stage with the parts, and the command, that the records show without their largest cause.
+    """Fit the plain stage with the resonance that the records show without their largest cause.
 
-    Beside a cause that is many times what a resonance makes, a plain stage shows none, nor how its command goes
-    between samples. What comes first is that plain stage, and second where it belongs beside the cause, from where
-    effects are asked for: a fit without any may end too far from there. None where the records show the same parts
-    as before, or no cause explains most of the misfit.
+    Beside a cause that is many times what a resonance makes, a plain stage shows none. What comes first is that plain
+    stage, and second where it belongs beside the cause, from where effects are asked for: a fit without any may end
+    too far from there. None where the stage has a resonance, or shows none so either, or no cause explains most of
+    the misfit.
     """
-    cleaned = without_largest(ready, found)
+    cleaned = None if ready.baseline.resonance_Hz is not None else without_largest(ready, found)
     if cleaned is None or not has_time():
         return None
     progress("fitting the plain stage again, to what the largest cause leaves")
-    cleaned, there, said = decide_plain_stage(cleaned, progress, has_time)
-    if _structure(there.regression.baseline) == _structure(ready.baseline) or not has_time():
+    there = fit_plain_stage(cleaned, tuple(run.hold for run in ready.baseline.runs), progress)
+    if not (rings(there) and has_time()):
         return None
+    cleaned, there, said = decide_plain_stage(cleaned, progress, has_time, there.regression.baseline.problem)
     reading = replace(ready.reading, fraction=cleaned.fraction)
     plain = fit_plain_stage(reading, there.holds, progress, there.regression.baseline.problem, there.faults)
     baseline, beside = plain.regression.baseline, there.regression.baseline
-    if _structure(baseline) != _structure(beside) or len(baseline.columns_um) != len(beside.columns_um):
+    alike = [type(part) for part in baseline.stage.parts] == [type(part) for part in beside.stage.parts]
+    if not (rings(there) and alike) or len(baseline.columns_um) != len(beside.columns_um):
         return None
     z = np.asarray(baseline.chain.coordinates.of(beside.stage))
     moved = replace(baseline, z=z, columns_um=beside.columns_um, prior=beside.prior, hyper=beside.hyper)
@@ -86,8 +88,3 @@ def without_largest(ready: Prepared, found: Selection) -> Reading | None:
         records=list(map(cleaned, reading.records, alone.change_um)),
         aside=list(map(cleaned, reading.aside, aside_um)),
     )
-
-
-def _structure(baseline: Baseline) -> tuple[object, ...]:
-    """Which parts a plain stage has, and how its command goes between the samples of each run."""
-    return tuple(type(part) for part in baseline.stage.parts), tuple(run.hold for run in baseline.runs)
