@@ -15,7 +15,9 @@ from fits.diagnosis._prepare import Prepared, Reading, decide_plain_stage, fit_p
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import regress
 from fits.diagnosis._thresholds import Thresholds
+from fits.io._errors import DataError
 from fits.io._record import Record
+from fits.loop._result import FitError
 
 
 def look_again(
@@ -32,12 +34,16 @@ def look_again(
     if cleaned is None or not has_time():
         return None
     progress("fitting the plain stage again, to what the largest cause leaves")
-    there = fit_plain_stage(cleaned, tuple(run.hold for run in ready.baseline.runs), progress)
-    if not (rings(there) and has_time()):
+    try:
+        there = fit_plain_stage(cleaned, tuple(run.hold for run in ready.baseline.runs), progress)
+        if not (rings(there) and has_time()):
+            return None
+        cleaned, there, said = decide_plain_stage(cleaned, progress, has_time, there.regression.baseline.problem)
+        reading = replace(ready.reading, fraction=cleaned.fraction)
+        plain = fit_plain_stage(reading, there.holds, progress, there.regression.baseline.problem, there.faults)
+    except (DataError, FitError):
+        # What a cause leaves may be no loop any more.
         return None
-    cleaned, there, said = decide_plain_stage(cleaned, progress, has_time, there.regression.baseline.problem)
-    reading = replace(ready.reading, fraction=cleaned.fraction)
-    plain = fit_plain_stage(reading, there.holds, progress, there.regression.baseline.problem, there.faults)
     baseline, beside = plain.regression.baseline, there.regression.baseline
     alike = [type(part) for part in baseline.stage.parts] == [type(part) for part in beside.stage.parts]
     if not (rings(there) and alike) or len(baseline.columns_um) != len(beside.columns_um):
