@@ -25,6 +25,7 @@ from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import PAST_IS_ESTIMATED, Progress, Run, command_range_V, prepare_run, prepare_runs, simulate_run
 from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
+from fits.loop._voltage_noise import noisy_voltages
 from fits.stats._metrics import TOLD, WHITE
 from fits.stats._noise import LOSSES
 from microid import Preisach
@@ -105,7 +106,10 @@ def fit(
         remarks.append(correlated(found.correlation, "creep, rate, drift or a density this family cannot follow"))
     model, columns = found.model, np.asarray(columns_of(found.model))
     surface = tried.data.grid.surface(columns)
-    if found.correlation > WHITE:
+    noisy = noisy_voltages(runs, [left_of(surface, run) for run in runs])
+    remarks += noisy
+    # A lag would smooth a noisy voltage, and be none.
+    if found.correlation > WHITE and not noisy:
         progress("looking for lags and relaxations")
         whole = [run for run in runs if not run.has_past]
         remarks += suggestions(whole, surface, stroke, tried.solution.hyper) if whole else []

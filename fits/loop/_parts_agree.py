@@ -26,6 +26,8 @@ _TIMES = 2.0
 _PLACES = 5
 # Samples that each part of a run needs.
 _FEWEST_SAMPLES = 200
+# A hysteresis takes part of a delay for width: it is known to so many samples at best.
+_SURELY = 0.5
 
 
 def check_loops(
@@ -185,12 +187,11 @@ def delays(
         # Where it leaves more than twice the noise it must take most of the residual away.
         if (
             gained < 30.0  # in twice the log likelihood
-            or abs(samples) < 5 * sd
+            or abs(samples) < max(5 * sd, _SURELY)
             or after > (0.4 if after > 2.0 * miss.noise_um else 1.0) * before
         ):
             continue
-        # A hysteresis takes part of a delay for width: it is known to half a sample at best.
-        sd = max(sd, 0.5)
+        sd = max(sd, _SURELY)
         size = f"{abs(samples):.1f} +- {sd:.1f} samples ({abs(samples) * interval:.3g} s)"
         where = "AFTER the voltage" if samples > 0 else "BEFORE the voltage that causes it"
         remarks.append(
