@@ -80,6 +80,23 @@ def test_its_gain_and_loss_vary_with_the_voltage(rng, gain, loss):
     np.testing.assert_allclose(through(effect, 1e-3, voltage), given - amplitude * states, atol=1e-3 * amplitude)
 
 
+@pytest.mark.parametrize(("sigma", "exponent", "approach"), [(1.1, 1.4, 1.0), (1.0, 1.0, 1.4), (0.8, 1.8, 1.0)])
+def test_steps_of_several_lengths_are_followed_as_well(rng, sigma, exponent, approach):
+    """They had been two steps of the rule, off by up to a fourteenth of the part."""
+    hysteresis, voltage = random_model(rng, 8), np.repeat(rng.uniform(10, 90, 40), 5)
+    amplitude, length = 2.0, 12.0
+    given = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 80, sigma, exponent, 80.0)
+    effect = replace(given, approach=jnp.asarray(approach))
+
+    def slope(_, z, way):
+        left = 1 - abs(z) ** exponent * (1 - sigma + sigma * np.sign(z) * way)
+        return np.sign(left) * abs(left) ** approach / length
+
+    states = followed([float(hysteresis.density.lower_V), *voltage], -1.0, slope)
+    plain = through(hysteresis, 1e-3, voltage)
+    np.testing.assert_allclose(through(effect, 1e-3, voltage), plain - amplitude * states, atol=2e-3 * amplitude)
+
+
 def followed(voltage, first, slope):
     """States at all voltages but the first by adaptive integration along the voltage."""
     states = [first]

@@ -17,8 +17,9 @@ from microid.effects._legendre import _legendre
 # A move of the voltage longer than this part of the length is divided into so many steps of the classical Runge-Kutta
 # rule; any other is one.
 _LONG, _FINE = 0.1, 16
+# A move over the length, gain and loss at its ends and in its middle, and the places of its ends in the range.
+_Move: TypeAlias = tuple[Array, Array, Array, Array]
 _SMALL = 1e-12
-Moves: TypeAlias = tuple[Array, Array, Array, Array]
 # Each polynomial is at most so much of the logarithm of gain or loss.
 _VARIED = 3.0
 # So many places in the range at which the farthest limit of the state is looked for.
@@ -145,7 +146,6 @@ class BoucWenHysteresis(AbstractEffect):
         """The state at all voltages but the first, at which it is given."""
         lowest, highest = self._limit(-1.0), self._limit(1.0)
         places = jnp.clip(2 * (voltage_V - self.lower_V) / self.range_V - 1, -1, 1)
-        move_V = jnp.diff(voltage_V)
         # At the ends and in the middle of each step, all at once: in the loop they would take most of the time.
         three = jnp.stack([places[:-1], (places[:-1] + places[1:]) / 2, places[1:]], axis=1)
 
@@ -162,13 +162,13 @@ class BoucWenHysteresis(AbstractEffect):
             size = jnp.maximum(jnp.abs(left), _SMALL)
             return gain * jnp.sign(left) * jnp.exp(self.approach * jnp.log(size))
 
-        def step(z: Array, step: Array, gain: Array, loss: Array) -> Array:
-            way = jnp.sign(step)
+        def step(z: Array, length: Array, gain: Array, loss: Array) -> Array:
+            way = jnp.sign(length)
             k1 = slope(z, way, gain[0], loss[0])
-            k2 = slope(z + step * k1 / 2, way, gain[1], loss[1])
-            k3 = slope(z + step * k2 / 2, way, gain[1], loss[1])
-            k4 = slope(z + step * k3, way, gain[2], loss[2])
-            return jnp.clip(z + step * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest)
+            k2 = slope(z + length * k1 / 2, way, gain[1], loss[1])
+            k3 = slope(z + length * k2 / 2, way, gain[1], loss[1])
+            k4 = slope(z + length * k3, way, gain[2], loss[2])
+            return jnp.clip(z + length * (k1 + 2 * k2 + 2 * k3 + k4) / 6, lowest, highest)
 
         def in_steps(z: Array, length: Array, gain: Array, loss: Array, ends: Array) -> Array:
             whole = jnp.linspace(ends[0], ends[1], 2 * _FINE + 1)
@@ -182,16 +182,16 @@ class BoucWenHysteresis(AbstractEffect):
         def at_once(z: Array, length: Array, gain: Array, loss: Array, ends: Array) -> Array:
             return step(z, length, gain, loss)
 
-        def visit(z: Array, move: Moves) -> tuple[Array, Array]:
+        def visit(z: Array, move: _Move) -> tuple[Array, Array]:
             z = at_once(z, *move)
             return z, z
 
-        def visit_any(z: Array, move: Moves) -> tuple[Array, Array]:
+        def visit_any(z: Array, move: _Move) -> tuple[Array, Array]:
             z = lax.cond(jnp.abs(move[0]) > _LONG, in_steps, at_once, z, *move)
             return z, z
 
         ends = jnp.stack([places[:-1], places[1:]], axis=1)
-        moves = move_V / (self.length_share * self.range_V), *self._varied(three), ends
+        moves = jnp.diff(voltage_V) / (self.length_share * self.range_V), *self._varied(three), ends
         # To ask at each move takes as long as to make it.
         return lax.cond(
             jnp.any(jnp.abs(moves[0]) > _LONG),
