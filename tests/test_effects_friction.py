@@ -82,7 +82,7 @@ def test_its_gain_and_loss_vary_with_the_voltage(rng, gain, loss):
 
 @pytest.mark.parametrize(("sigma", "exponent", "approach"), [(1.1, 1.4, 1.0), (1.0, 1.0, 1.4), (0.8, 1.8, 1.0)])
 def test_steps_of_several_lengths_are_followed_as_well(rng, sigma, exponent, approach):
-    """They had been two steps of the rule, off by up to a fourteenth of the part."""
+    """They had been two steps of the rule, off by 4 to 14 % of the part."""
     hysteresis, voltage = random_model(rng, 8), np.repeat(rng.uniform(10, 90, 40), 5)
     amplitude, length = 2.0, 12.0
     given = BY_NAME["bouc_wen_hysteresis", ""](hysteresis, amplitude, length / 80, sigma, exponent, 80.0)
