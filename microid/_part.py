@@ -52,11 +52,14 @@ class Scene(eqx.Module):
         Further columns of the record by name, such as `temperature_degC`, each of shape `(t,)`.
     memory
         State of the hysteresis before it came to rest under the command before the first sample.
+    past_um
+        What the hysteresis gives beside that, shape `(t,)`, where that state is not the one that it was in.
     """
 
     command: Signal
     columns: dict[str, Float[Array, " t"]]
     memory: Any = None
+    past_um: Float[Array, " t"] | None = None
 
 
 class AbstractPart(eqx.Module):
@@ -137,6 +140,8 @@ class AbstractHysteresis(AbstractPart):
         """Pass a voltage on, which has come from the scene's memory to its value before the first sample."""
         memory = start.memory if isinstance(start, Scene) else start
         displacement_um = self(jnp.concatenate([signal.before[None], signal.values]), memory)
+        if isinstance(start, Scene) and start.past_um is not None:
+            displacement_um = displacement_um + jnp.concatenate([start.past_um[:1], start.past_um])
         return signal.with_values(displacement_um[1:], displacement_um[0])
 
 

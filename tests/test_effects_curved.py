@@ -31,7 +31,7 @@ def test_it_bends_what_the_past_leaves_and_not_what_follows_the_voltage(rng, sha
     def curve(displacement):
         return half * np.polynomial.legendre.legval((displacement - centre) / half, [0, 0, *parts])
 
-    effect = BY_NAME["accommodation", "curve"](model, *(float(part) for part in parts), centre, half)
+    effect = BY_NAME["curved_hysteresis", ""](model, *(float(part) for part in parts), centre, half)
     change = through(effect, 1e-3, path) - through(model, 1e-3, path)
     expected = curve(plain) - curve(middle)
     assert np.ptp(expected) > 1e-3 * half

@@ -15,6 +15,7 @@ from fits.io._kept import forget_programs
 from fits.io._record import Record
 from fits.io._threads import map_in_threads
 from fits.stage._motion import Prepared, at_samples, prepare, signals
+from fits.stage._run import fitted_past, place_of_hysteresis
 from microid import Coordinates, Sensor
 from microid.effects import AbstractEffect
 
@@ -30,9 +31,13 @@ class Bench:
     """A fitted stage and the runs, ready to be simulated with effects.
 
     The runs are those held out whole where it is `aside`; intervals are divided into many steps where it is `finest`.
+    What effects change depends on where a rig is, and until its unknown past is wiped out that is not where the model
+    is: that past is fitted to the runs, without what effects are known to have `changed_um` in them.
     """
 
-    def __init__(self, baseline: Baseline, aside: bool = False, finest: bool = False):
+    def __init__(
+        self, baseline: Baseline, changed_um: Sequence[np.ndarray] = (), aside: bool = False, finest: bool = False
+    ):
         self.baseline = baseline
         stage = baseline.stage.with_substeps(1)
         # What a fit may move is looked up anew for every stage that is built.
@@ -42,6 +47,10 @@ class Bench:
         self.prepared = [prepare(self.stage, run) for run in (many if finest else few)]
         self.known = map_in_threads(signals, [self.stage] * len(self.prepared), self.prepared)
         self.plain = [at_samples(known[-1], one) for known, one in zip(self.known, self.prepared, strict=True)]
+        self._past_um = [np.zeros_like(plain) for plain in self.plain]
+        for run, one in enumerate(self.prepared):
+            if one.run.has_past:
+                self._add_past(run, changed_um[run] if changed_um else self._past_um[run])
 
     def respond(self, effects: Sequence[Sequence[AbstractEffect]]) -> list[np.ndarray]:
         """Simulate all runs with effects, one list of effects per run; um, shape `(n,)` each."""
@@ -51,7 +60,18 @@ class Bench:
         """Simulate one run with effects; um, shape `(n,)`."""
         one = self.prepared[run]
         stage = with_effects(self.stage, self._seen(effects, one))
-        return at_samples(signals(stage, one, self.stage, self.known[run])[-1], one)
+        return at_samples(signals(stage, one, self.stage, self.known[run])[-1], one) - self._past_um[run]
+
+    def _add_past(self, run: int, changed_um: np.ndarray) -> None:
+        """Have a run simulated with its unknown past."""
+        one, known = self.prepared[run], self.known[run]
+        samples, place = one.run.samples, place_of_hysteresis(self.stage)
+        left_um = samples.displacement_um - known[-1].values[:: samples.stride]
+        past_um = fitted_past(self.stage, samples, left_um.at[: len(changed_um)].add(-changed_um))
+        self.prepared[run] = replace(one, scene=replace(one.scene, past_um=past_um))
+        # Ahead of the hysteresis nothing is another.
+        self.known[run] = signals(self.stage, self.prepared[run], self.stage, known[: (place or 0) + 1])
+        self._past_um[run] = at_samples(self.known[run][-1], one) - self.plain[run]
 
     def _seen(self, effects: Sequence[AbstractEffect], prepared: Prepared) -> list[AbstractEffect]:
         """Those that a run may be asked about: none that is its own and too fast for its samples."""

@@ -102,7 +102,7 @@ class Search:
         if found is None:
             return self.probes
         # Where the stage goes beside these effects, and not without.
-        there = Bench(projector.move(left))
+        there = Bench(projector.move(left), model.change_um)
         scales = scales_of(there, min(noise.total_um for noise in projector.noise), found)
         have = [model.effects(run) for run in range(len(readings_um))]
         more = [probe for form in forms for probe in probes_of(there, form, scales, None, have)]

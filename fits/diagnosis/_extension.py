@@ -75,7 +75,7 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None, own: bo
     effects = shared_effects(model, len(baseline.runs), ready.reading.thresholds.minor_share, own)
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
     stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)
-    compared = _compare(ready, Bench(regression.baseline), model, regression, effects, found.finest)
+    compared = _compare(ready, Bench(regression.baseline, model.change_um), model, regression, effects, found.finest)
     return Extension(stage, regression.baseline, compared, tuple(effects), own)
 
 
@@ -255,7 +255,7 @@ def feedforward(bench: Bench, effects: Sequence[AbstractEffect]) -> tuple[float,
     errors = []
     for _ in range(_ROUNDS):
         signal = eqx.tree_at(lambda s: s.values, one.scene.command, jnp.asarray(command))
-        moved = replace(one, scene=eqx.tree_at(lambda s: s.command, one.scene, signal))
+        moved = replace(one, scene=replace(one.scene, command=signal, past_um=None))
         off = wanted - at_samples(signals(stage, moved)[-1], moved)
         off = off - np.mean(off)
         errors.append(float(np.sqrt(np.mean(off**2))))

@@ -158,7 +158,7 @@ def refine(
         state = improved(*state) if has_time() else state
     model, finest = refine_steps(*state)
     # What is asked of the causes from here on is asked as they were fitted.
-    bench, projector = Bench(state[0].baseline, finest=True) if finest else state[0], state[1]
+    bench, projector = Bench(state[0].baseline, model.change_um, finest=True) if finest else state[0], state[1]
     inside = leave_bounds(bench, projector, model, finest) if has_time() else (bench, projector, model)
     return *keep_density_positive(*inside, finest, has_time), finest
 
@@ -194,7 +194,7 @@ def relearn_smoothness(bench: Bench, projector: Projector, model: Refit) -> Stat
     if not _prior_precision(afresh) > _SMOOTHER * _prior_precision(projector):
         # What the causes leave is no roughness.
         return bench, projector, model
-    moved = fit_jointly(Bench(afresh.regression.baseline), afresh, model)
+    moved = fit_jointly(Bench(afresh.regression.baseline, model.change_um), afresh, model)
     before, after = (at.held_out(one.change_um) for at, one in ((projector, model), moved[1:]))
     return (bench, projector, model) if improvement_z(before, after) < 0 else moved
 
@@ -203,7 +203,7 @@ def refine_steps(bench: Bench, projector: Projector, model: Refit) -> tuple[Refi
     """Fit the causes again with many steps between samples, where few are off by more than chance."""
     if not model.laws:
         return model, False
-    finer = Bench(bench.baseline, finest=True)
+    finer = Bench(bench.baseline, model.change_um, finest=True)
     better = refit(finer, projector, model.laws, model.x, 0)
     off = [a - b for a, b in zip(better.change_um, model.change_um, strict=True)]
     if float(np.linalg.norm(projector.join(off))) < _LARGEST_DIFFERENCE:
@@ -305,7 +305,7 @@ def _linearised_at(
     plain = not any(projector.regression.saturating) and not any(map(saturating, effects))
     regression = regress(baseline, projector.regression.finer if plain else None, effects)
     there = Projector(regression, projector.noise, projector.roughness).bounded(model.change_um)
-    return Bench(regression.baseline, finest=finest), there
+    return Bench(regression.baseline, model.change_um, finest=finest), there
 
 
 def _made_sensitive(projector: Projector, model: Refit) -> Baseline | None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from fits.diagnosis._joint_fit import alternate
 from fits.diagnosis._plain_fit import PlainFit, is_far_less
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit_beside
 from fits.diagnosis._score import Scored, score
 from fits.diagnosis._thresholds import Thresholds
@@ -21,6 +22,8 @@ _MOSTLY = 0.5
 _NOISE = 0.05
 # So many effects beside a lag are fitted.
 _TRIED = 2
+# So many time constants after the first sample a lag has settled.
+_SETTLED = 8
 
 
 def may_be_of_driver(plain: PlainFit, thresholds: Thresholds) -> bool:
@@ -63,10 +66,22 @@ def is_of_driver(driver: PlainFit, plain: PlainFit, thresholds: Thresholds) -> b
     left, noise = float(driver.left @ driver.left), len(driver.left)
     if left <= (1 + _NOISE) * noise:
         return True
-    there = plain.in_noise_of(driver)
-    lags = _beside_lags(there)
-    beside = min((alternate(there.bench, there.projector, lag)[-1].cost for lag in lags), default=left)
+    there, lag_s = plain.in_noise_of(driver), lag_of(driver)
+    ends = [alternate(there.bench, there.projector, lag) for lag in _beside_lags(there)]
+    # Either follows what moved before the record in a way of its own.
+    left = _left_later(driver.projector, driver.left, lag_s)
+    beside = min((_left_later(end[1], end[-1].residual, lag_s) for end in ends), default=left)
     return left < beside + max(thresholds.other_hold_z**2, thresholds.model_error * (beside - noise))
+
+
+def _left_later(projector: Projector, residual: np.ndarray, lag_s: float) -> float:
+    """Sum of squares of what is left once a lag has settled from where it was before each run."""
+    found, regression = 0.0, projector.regression
+    for part, mask, run in zip(projector.split(residual), projector.masks, regression.baseline.runs, strict=True):
+        time_s = run.record.time_s - run.record.time_s[0]
+        later = part[time_s[mask] > _SETTLED * lag_s]
+        found += float(later @ later)
+    return found
 
 
 def _is_damped(plain: PlainFit) -> bool:

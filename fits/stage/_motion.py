@@ -58,6 +58,7 @@ def signals(
     """
     pairs = () if like is None else zip(stage.parts, like.parts, strict=False)
     same = sum(1 for _ in takewhile(lambda pair: _is_same(*pair), pairs))
+    same = max(min(same, len(known) - 1), 0)
     found = [*known[: same + 1]] or [prepared.scene.command]
     for k in range(same, len(stage.parts)):
         # Neighbouring linear parts are one system from the first of them on.

@@ -22,6 +22,8 @@ from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
+# Powers of what a driver was charged with.
+_POWERS = 3
 
 
 @kept
@@ -37,35 +39,67 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     """What a run's nuisance parameters add, `(n, k)`: an offset in um, its past, and how the stage moved before.
 
     The latter are free motions of what follows the hysteresis, or of the whole chain without one, and of relaxations
-    behind it. What still settles ahead of the hysteresis when the record begins is not among them.
+    behind it; and of a driver ahead of it, what it was still charged with, as a hysteresis gives it: its powers, as
+    the slope of a branch is not the same all along.
     """
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
     if samples.has_past and place is not None:
-        seen = ahead(stage, place, samples)
-        # How far a lagging command goes may show after what is fitted only: a kink there could not be learnt.
-        at_V, fitted = seen.values[:: samples.stride], samples.weight > 0
-        end_V = jnp.max(jnp.where(fitted, at_V, -jnp.inf)), jnp.min(jnp.where(fitted, at_V, jnp.inf))
-        past = past_columns(jnp.clip(seen.values, end_V[1], end_V[0]))
+        past, seen = _past_ahead(stage, place, samples)
         offset = jnp.concatenate([offset, answered(stage, place, samples, past, seen)], axis=1)
-    behind = stage.parts[0 if place is None else place + 1 :]
-    if samples.moving:
-        time = samples.time_s - samples.time_s.ravel()[0]
-        if samples.time_s.ndim == 0:
-            time = samples.time_s * jnp.arange(samples.voltage_V.shape[0], dtype=time.dtype)
-        relaxing = [p for p in behind if isinstance(p, m.effects.AbstractEffect) and p.relaxation]
-        late = [jnp.exp(-time / getattr(part, part.relaxation)) for part in relaxing]
-        offset = jnp.concatenate([offset, *(one[:: samples.stride, None] for one in late)], axis=1)
-    system = joined(behind)
-    if not samples.moving or system is None or system.order == 0:
+    if not samples.moving:
         return offset
+    behind = stage.parts[0 if place is None else place + 1 :]
+    time = samples.time_s - samples.time_s.ravel()[0]
+    if samples.time_s.ndim == 0:
+        time = samples.time_s * jnp.arange(samples.voltage_V.shape[0], dtype=time.dtype)
+    relaxing = [p for p in behind if isinstance(p, m.effects.AbstractEffect) and p.relaxation]
+    late = [jnp.exp(-time / getattr(part, part.relaxation)) for part in relaxing]
+    offset = jnp.concatenate([offset, *(one[:: samples.stride, None] for one in late)], axis=1)
+    if place is not None and (charging := _free_motions(stage.parts[:place], samples)) is not None:
+        charging = charging / (jnp.max(jnp.abs(charging), axis=0)[None] + _TINY)
+        powers = jnp.concatenate([charging**power for power in range(1, _POWERS + 1)], axis=1)
+        columns = answered(stage, place, samples, powers, ahead(stage, place, samples))
+        offset = jnp.concatenate([offset, columns], axis=1)
+    swinging = _free_motions(behind, samples)
+    return offset if swinging is None else jnp.concatenate([offset, swinging[:: samples.stride]], axis=1)
+
+
+def _free_motions(parts: Sequence[Any], samples: Samples) -> Float[Array, "m s"] | None:
+    """What linear parts give from each of their states on, at the refined times; None without such parts."""
+    system = joined(parts)
+    if system is None or system.order == 0:
+        return None
     nothing = jnp.zeros_like(samples.voltage_V)
 
-    def free(state: Float[Array, " s"]) -> Float[Array, " n"]:
+    def free(state: Float[Array, " s"]) -> Float[Array, " m"]:
         alone = m.LinearSystem(system.rate_per_s, state, system.read, jnp.zeros(()), jnp.zeros(()))
-        return alone.respond(samples.time_s, nothing, jnp.ones(()))[:: samples.stride]
+        return alone.respond(samples.time_s, nothing, jnp.ones(()))
 
-    return jnp.concatenate([offset, jax.vmap(free)(jnp.eye(system.order)).T], axis=1)
+    return jax.vmap(free)(jnp.eye(system.order)).T
+
+
+def _past_ahead(stage: m.Stage, place: int, samples: Samples) -> tuple[Float[Array, "m k"], m.Signal]:
+    """Signals of an unknown past where the hysteresis gives them, at the refined times, and what goes into it."""
+    seen = ahead(stage, place, samples)
+    # How far a lagging command goes may show after what is fitted only: a kink there could not be learnt.
+    at_V, fitted = seen.values[:: samples.stride], samples.weight > 0
+    end_V = jnp.max(jnp.where(fitted, at_V, -jnp.inf)), jnp.min(jnp.where(fitted, at_V, jnp.inf))
+    return past_columns(jnp.clip(seen.values, end_V[1], end_V[0])), seen
+
+
+@kept
+def fitted_past(stage: m.Stage, samples: Samples, left_um: Float[Array, " n"]) -> Float[Array, " m"]:
+    """What the unknown past of a run makes its hysteresis give, in um, at the refined times, shape `(m,)`.
+
+    It is fitted, beside the other nuisance parameters, to what a stage leaves of the run.
+    """
+    place = place_of_hysteresis(stage)
+    if place is None:
+        return jnp.zeros_like(samples.voltage_V)
+    past, _ = _past_ahead(stage, place, samples)
+    # Ahead of them is the offset.
+    return past @ _best_factors(nuisance_columns(stage, samples), samples.weight, left_um)[1 : 1 + past.shape[1]]
 
 
 def answered(
@@ -101,11 +135,18 @@ def project_out(
     columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Take the best combination of some columns off, by weighted least squares."""
+    return values - columns @ _best_factors(columns, weight, values)
+
+
+def _best_factors(
+    columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
+) -> Float[Array, " k"]:
+    """Of columns, by weighted least squares."""
     scale = jnp.sqrt(jnp.sum(weight[:, None] * columns**2, axis=0)) + _TINY
     scaled = columns / scale[None, :]
     weighted = weight[:, None] * scaled
     gram = scaled.T @ weighted + _TINY * jnp.eye(columns.shape[1])
-    return values - scaled @ jnp.linalg.solve(gram, weighted.T @ values)
+    return jnp.linalg.solve(gram, weighted.T @ values) / scale
 
 
 def simulate_stage(stage: m.Stage, run: Run) -> np.ndarray:

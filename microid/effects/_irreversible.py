@@ -1,12 +1,13 @@
 """What of a hysteresis depends on the voltage alone, and what on its past."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from microid._part import AbstractPart, Signal, innermost
+from microid._part import AbstractPart, Scene, Signal, innermost
 from microid._preisach import Preisach
 
 # Levels of the sweep, and its interval: so slow that no effect of the rate is left.
@@ -27,7 +28,8 @@ def _anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
     step = (high - low) / (_LEVELS - 1)
     up = low + step * jnp.asarray(np.arange(_LEVELS), dtype=low.dtype)
     sweep = Signal(jnp.concatenate([up, up[::-1], up]), low, "first")
-    branches = inner.run(jnp.asarray(_SLOW_S, dtype=low.dtype), sweep, start).values.reshape(3, _LEVELS)
+    slowly_s = jnp.asarray(_SLOW_S, dtype=low.dtype)
+    branches = inner.run(slowly_s, sweep, _without_past(start)).values.reshape(3, _LEVELS)
     mean = (branches[1][::-1] + branches[2]) / 2
 
     def at(voltage_V: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -37,3 +39,8 @@ def _anhysteretic(inner: AbstractPart, signal: Signal, start: Any) -> Signal:
         return mean[left] * (1 - share) + mean[left + 1] * share
 
     return signal.with_values(at(signal.values), at(signal.before))
+
+
+def _without_past(start: Any) -> Any:
+    """The same before the first sample; what an unknown past adds belongs to the signal of the scene alone."""
+    return replace(start, past_um=None) if isinstance(start, Scene) else start

@@ -37,7 +37,13 @@ class Aging(AbstractEffect):
         "The residual is in proportion to the position, by a factor that grows slowly with the cycles and not with "
         "the time."
     )
-    confusions: ClassVar[tuple[str, ...]] = ("thermal_gain", "thermal_drift", "creep", "accommodation")
+    confusions: ClassVar[tuple[str, ...]] = (
+        "thermal_gain",
+        "thermal_drift",
+        "creep",
+        "accommodation",
+        "curved_hysteresis",
+    )
     experiment: ClassVar[str] = (
         "The same loop at the start, in the middle and at the end, and again after an hour at rest."
     )

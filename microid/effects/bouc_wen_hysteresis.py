@@ -85,7 +85,7 @@ class BoucWenHysteresis(AbstractEffect):
         "Minor loops between the same voltages differ in height and do not close, at any rate: a reversal is "
         "forgotten by and by as the voltage goes on, and not at once when it is passed."
     )
-    confusions: ClassVar[tuple[str, ...]] = ("accommodation",)
+    confusions: ClassVar[tuple[str, ...]] = ("accommodation", "curved_hysteresis")
     experiment: ClassVar[str] = "The same small loop at three biases, ten times each, at two rates."
     source: ClassVar[str] = (
         "Bouc 1967; Wen 1976; normalised as by Ikhouane & Rodellar, Systems with Hysteresis (2007); asymmetry of "

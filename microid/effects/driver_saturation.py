@@ -12,14 +12,15 @@ from microid._param import param
 from microid._part import AbstractPart, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, register
 
-_LEVELS = (0.99, 0.97, 0.94, 0.90)
+# Of the range; and a gain from which a fit finds the way to others.
+_LEVELS, _SOME = (0.99, 0.97, 0.94, 0.90), 0.03
 
 
 @register
 class DriverSaturation(AbstractEffect):
     r"""An upper rail.
 
-    .. math:: \min(u, u_{max})
+    .. math:: \min(u, u_{max} + g (u - u_{max}))
 
     There is no strength: the effect vanishes as the rail moves beyond the range of the command.
 
@@ -27,6 +28,8 @@ class DriverSaturation(AbstractEffect):
     ----------
     rail_V
         `u_max`, of the command.
+    gain_beyond
+        `g`: what a soft rail lets through of what is beyond it; none of it by default.
     """
 
     name: ClassVar[str] = "driver_saturation"
@@ -43,22 +46,23 @@ class DriverSaturation(AbstractEffect):
     source: ClassVar[str] = "rails at 95 to 103 % of the nominal range under load (estimate)"
     column: ClassVar[str] = "drive_monitor_V"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
+    gain_beyond: Float[Array, ""] = param(default=0.0, unit="1", scale=0.1, lower=0.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Rails at 99, 97, 94 and 90 % of the range."""
         span = scales.upper_V - scales.lower_V
-        return tuple((cls(jnp.asarray(scales.lower_V + level * span)),) for level in _LEVELS)
+        return tuple((cls(jnp.asarray(scales.lower_V + level * span), jnp.asarray(_SOME)),) for level in _LEVELS)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is above the rail."""
-        values, before = (jnp.minimum(x, self.rail_V) for x in (signal.values, signal.before))
+        values, before = (jnp.minimum(x, _beyond(self, x)) for x in (signal.values, signal.before))
         return signal.with_values(values, before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Cut off what is above the rail."""
         rail_V: Any = self.rail_V
-        values, before = (np.where(x.real < rail_V.real, x, rail_V) for x in (signal.values, signal.before))
+        values, before = (np.where(x.real < rail_V.real, x, _beyond(self, x)) for x in (signal.values, signal.before))
         return signal._replace(values=values, before=before)
 
 
@@ -70,6 +74,8 @@ class LowerDriverSaturation(AbstractEffect):
     ----------
     rail_V
         `u_min`, of the command.
+    gain_beyond
+        See `DriverSaturation`.
     """
 
     name: ClassVar[str] = "driver_saturation"
@@ -85,20 +91,26 @@ class LowerDriverSaturation(AbstractEffect):
     source: ClassVar[str] = DriverSaturation.source
     column: ClassVar[str] = "drive_monitor_V"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
+    gain_beyond: Float[Array, ""] = param(default=0.0, unit="1", scale=0.1, lower=0.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Rails at 1, 3, 6 and 10 % of the range."""
         span = scales.upper_V - scales.lower_V
-        return tuple((cls(jnp.asarray(scales.upper_V - level * span)),) for level in _LEVELS)
+        return tuple((cls(jnp.asarray(scales.upper_V - level * span), jnp.asarray(_SOME)),) for level in _LEVELS)
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is below the rail."""
-        values, before = (jnp.maximum(x, self.rail_V) for x in (signal.values, signal.before))
+        values, before = (jnp.maximum(x, _beyond(self, x)) for x in (signal.values, signal.before))
         return signal.with_values(values, before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Cut off what is below the rail."""
         rail_V: Any = self.rail_V
-        values, before = (np.where(x.real > rail_V.real, x, rail_V) for x in (signal.values, signal.before))
+        values, before = (np.where(x.real > rail_V.real, x, _beyond(self, x)) for x in (signal.values, signal.before))
         return signal._replace(values=values, before=before)
+
+
+def _beyond(effect: Any, voltage_V: Any) -> Any:
+    """What the amplifier gives beyond its rail."""
+    return effect.rail_V + effect.gain_beyond * (voltage_V - effect.rail_V)

@@ -1,5 +1,6 @@
 """Initial state: the hysteresis remembers a voltage from before the record."""
 
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
@@ -7,7 +8,7 @@ from jaxtyping import Array, Float
 
 from microid._linear import Times
 from microid._param import param
-from microid._part import AbstractPart, Signal
+from microid._part import AbstractPart, Scene, Signal
 from microid.effects._base import AbstractEffect, Place, Scales, View, register
 
 
@@ -58,5 +59,7 @@ class InitialState(AbstractEffect):
         if time.ndim == 1:
             ahead = time[1] - time[0] if time.shape[0] > 1 else jnp.ones_like(time[0])
             time = jnp.concatenate([(time[0] - ahead)[None], time])
+        if isinstance(start, Scene) and start.past_um is not None:
+            start = replace(start, past_um=jnp.concatenate([start.past_um[:1], start.past_um]))
         given = self.inner.run(time, longer, start)
         return given.with_values(given.values[1:], given.values[0])

@@ -36,7 +36,12 @@ class SensorNonlinearity(AbstractEffect):
         "The residual is a function of the position alone, the same upwards and downwards and at all rates, and "
         "small oscillations are scaled by its slope."
     )
-    confusions: ClassVar[tuple[str, ...]] = ("stiffness_hardening", "accommodation", "driver_saturation")
+    confusions: ClassVar[tuple[str, ...]] = (
+        "stiffness_hardening",
+        "accommodation",
+        "curved_hysteresis",
+        "driver_saturation",
+    )
     experiment: ClassVar[str] = (
         "Small chirps or minor loops at four biases, each reached from above and below, or a reference sensor."
     )

@@ -49,7 +49,7 @@ class ThermalGain(AbstractEffect):
         "The residual is in proportion to the position, by a factor that grows with heavy driving or with the "
         "temperature and decays in pauses."
     )
-    confusions: ClassVar[tuple[str, ...]] = ("aging", "accommodation", "creep", "thermal_drift")
+    confusions: ClassVar[tuple[str, ...]] = ("aging", "accommodation", "creep", "thermal_drift", "curved_hysteresis")
     experiment: ClassVar[str] = "A slow loop, a burst of heavy driving, the same loop, a pause, and the same loop."
     source: ClassVar[str] = "PI piezo tutorial, temperature effects; 0.1 to 0.5 % per K (estimate)"
     view: ClassVar[View] = "time"
