@@ -156,6 +156,27 @@ def test_what_a_past_adds_rings_as_the_mechanics_does(rng, stride):
     assert less < 0.02 * np.std(moved)
 
 
+@pytest.mark.parametrize("stride", [1, 3])
+def test_what_a_driver_was_still_charged_with_decays_along_the_slope_of_a_branch(rng, stride):
+    """A curved branch between a driver that began elsewhere and the mechanics, by SciPy."""
+    rate_Hz, natural, lag_s = 4000.0, 2 * np.pi * rng.uniform(150, 400), rng.uniform(1e-3, 3e-3)
+    parts = {"hysteresis": random_model(rng), "mechanics": m.Mechanics(natural / (2 * np.pi), 0.03)}
+    stage = m.Stage.of(driver=m.Driver(lag_s), **parts)
+    fine_s = np.arange(1199 * 8 + 1) / rate_Hz / 8
+    volts = np.full(1200, 0.4)
+    volts[600:] += 0.2 * np.sin(2 * np.pi * 10 * fine_s[:4800:8])
+    charged_V = rng.choice([-1, 1]) * rng.uniform(0.1, 0.3)
+    rest_V = 0.4 + lsim(([1.0], [lag_s, 1.0]), np.interp(fine_s, fine_s[::8], volts) - 0.4, fine_s)[1]
+    branch = np.polynomial.Polynomial([0.0, 1.0, *rng.uniform(-0.5, 0.5, 2)])
+    difference = branch(rest_V + charged_V * np.exp(-fine_s / lag_s)) - branch(rest_V)
+    moved = lsim(([natural**2], [1.0, 0.06 * natural, natural**2]), difference, fine_s)[1][::8]
+    run = prepare_run(Record(fine_s[::8], volts, volts), (0.1, 0.9), "unknown", 0.0, stride)
+    basis = np.asarray(nuisance_columns(stage, run.samples))[: len(moved)]
+    left = moved - basis @ np.linalg.lstsq(basis, moved, rcond=None)[0]
+    assert basis.shape[1] == 6
+    assert np.std(left) < 0.02 * np.std(moved)
+
+
 def test_columns_are_the_b_splines_of_scipy(rng):
     voltage = np.cumsum(rng.normal(0, 1, 200))
     for reached, columns in zip(

@@ -67,7 +67,8 @@ class Bench:
         one, known = self.prepared[run], self.known[run]
         samples, place = one.run.samples, place_of_hysteresis(self.stage)
         left_um = samples.displacement_um - known[-1].values[:: samples.stride]
-        past_um = fitted_past(self.stage, samples, left_um.at[: len(changed_um)].add(-changed_um))
+        left_um = left_um.at[: len(changed_um)].add(-changed_um)
+        past_um = fitted_past(self.stage, samples, one.run.coarser.samples, left_um)
         self.prepared[run] = replace(one, scene=replace(one.scene, past_um=past_um))
         # Ahead of the hysteresis nothing is another.
         self.known[run] = signals(self.stage, self.prepared[run], self.stage, known[: (place or 0) + 1])

@@ -89,17 +89,19 @@ def _past_ahead(stage: m.Stage, place: int, samples: Samples) -> tuple[Float[Arr
 
 
 @kept
-def fitted_past(stage: m.Stage, samples: Samples, left_um: Float[Array, " n"]) -> Float[Array, " m"]:
+def fitted_past(
+    stage: m.Stage, samples: Samples, coarser: Samples, left_um: Float[Array, " n"]
+) -> Float[Array, " m"]:
     """What the unknown past of a run makes its hysteresis give, in um, at the refined times, shape `(m,)`.
 
-    It is fitted, beside the other nuisance parameters, to what a stage leaves of the run.
+    It is fitted, beside the other nuisance parameters as `coarser` samples show them, to what a stage leaves.
     """
     place = place_of_hysteresis(stage)
     if place is None:
         return jnp.zeros_like(samples.voltage_V)
     past, _ = _past_ahead(stage, place, samples)
     # Ahead of them is the offset.
-    return past @ _best_factors(nuisance_columns(stage, samples), samples.weight, left_um)[1 : 1 + past.shape[1]]
+    return past @ _best_factors(nuisance_columns(stage, coarser), samples.weight, left_um)[1 : 1 + past.shape[1]]
 
 
 def answered(
