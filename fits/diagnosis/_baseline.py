@@ -17,6 +17,7 @@ from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, pasts_to_estimate, prepare_run
 from fits.stage._chain import Chain
+from fits.stage._charge import with_charges
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._motion import at_samples, prepare, signals
@@ -155,6 +156,27 @@ def fit_baseline(
         If neither can be fitted.
     """
     records, aside = with_paths(records, aside)
+    settings = holdout, initial, progress, holds, better
+    found = _fitted(records, aside, *settings, onward, left_out)
+    charged = with_charges(found.stage, (*found.runs, *found.aside))
+    same = (one.charged_V == run.charged_V for one, run in zip(charged, (*records, *aside), strict=True))
+    if not found.dynamic or all(same):
+        return found
+    progress("again with what the driver was charged with before the runs")
+    return _fitted(charged[: len(records)], charged[len(records) :], *settings, found.problem, left_out)
+
+
+def _fitted(
+    records: Sequence[Record],
+    aside: Sequence[Record],
+    holdout: float,
+    initial: str,
+    progress: Callable[[str], None],
+    holds: Sequence[Hold],
+    better: float,
+    onward: Problem | None,
+    left_out: tuple[str, ...],
+) -> Baseline:
     voltages = [record.voltage_V for record in (*records, *aside)]
     range_V = min(float(v.min()) for v in voltages), max(float(v.max()) for v in voltages)
     remarks: tuple[str, ...] = ()

@@ -47,15 +47,17 @@ class Samples(eqx.Module):
     """A run of `n` samples, padded, with `m = (n - 1) stride + 1` steps.
 
     `time_s` is the one interval between steps where they are even. `weight` is that of each sample in the sum of
-    squares, 0 where it is not fitted. `moving` says whether the stage may have been moving when the record began, and
-    `has_past` whether the unknown memory of its hysteresis is estimated. Between samples the command runs as `hold`
-    says, whatever that of a stage is. `beside` holds further columns under the names of `columns_beside`.
+    squares, 0 where it is not fitted. The stage rested under `rest_V` before; `moving` says whether it may have been
+    moving when the record began, and `has_past` whether the unknown memory of its hysteresis is estimated. Between
+    samples the command runs as `hold` says, whatever that of a stage is. `beside` holds further columns under the
+    names of `columns_beside`.
     """
 
     time_s: Float[Array, " m"] | Float[Array, ""]
     voltage_V: Float[Array, " m"]
     displacement_um: Float[Array, " n"]
     weight: Float[Array, " n"]
+    rest_V: Float[Array, ""]
     start: m.Start
     stride: int = eqx.field(static=True)
     moving: bool = eqx.field(static=True)
@@ -172,7 +174,8 @@ class Run:
             voltage_V=_refined(voltage, stride, self.hold),
             displacement_um=jnp.asarray(np.pad(measured, pad, mode="edge")),
             weight=jnp.asarray(np.pad(self.fit_weight, pad)),
-            start=m.Start(memory=staircase(self.extremes_V, _EXTREMES_OF_STAGE)),
+            rest_V=(rest_V := jnp.asarray(record.voltage_V[0] + record.charged_V)),
+            start=m.Start(rest_V, staircase(self.extremes_V, _EXTREMES_OF_STAGE)),
             stride=stride,
             moving=self.moving,
             has_past=self.has_past,

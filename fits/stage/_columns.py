@@ -67,7 +67,7 @@ def _propagated(
 ) -> Float[Array, "k n"]:
     stage, each = coordinates(z), slice(None, None, samples.stride)
     time_s = samples.time_s * samples.stride if samples.time_s.ndim == 0 else samples.time_s[each]
-    command = Signal(samples.voltage_V[each], samples.voltage_V[0], samples.hold)
+    command = Signal(samples.voltage_V[each], samples.rest_V, samples.hold)
     beside = {name: values[each] for name, values in samples.beside.items()}
     scene = Scene(command, beside, samples.start.memory)
 

@@ -39,7 +39,7 @@ class Prepared:
 
 def prepare(stage: Stage, run: Run) -> Prepared:
     samples = run.samples
-    command = Signal(samples.voltage_V, samples.voltage_V[0], samples.hold)
+    command = Signal(samples.voltage_V, samples.rest_V, samples.hold)
     return Prepared(run, Scene(command, samples.beside, samples.start.memory))
 
 

@@ -42,6 +42,19 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     behind it; and of a driver ahead of it, what it was still charged with, as a hysteresis gives it: its powers, as
     the slope of a branch is not the same all along.
     """
+    columns = settled_columns(stage, samples)
+    place = place_of_hysteresis(stage)
+    charging = _free_motions(stage.parts[:place], samples) if samples.moving and place is not None else None
+    if charging is None or place is None:
+        return columns
+    charging = charging / (jnp.max(jnp.abs(charging), axis=0)[None] + _TINY)
+    powers = jnp.concatenate([charging**power for power in range(1, _POWERS + 1)], axis=1)
+    more = answered(stage, place, samples, powers, ahead(stage, place, samples))
+    return jnp.concatenate([columns, more], axis=1)
+
+
+def settled_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
+    """The same but for what a driver was still charged with."""
     offset = jnp.ones((samples.weight.shape[0], 1))
     place = place_of_hysteresis(stage)
     if samples.has_past and place is not None:
@@ -56,11 +69,6 @@ def nuisance_columns(stage: m.Stage, samples: Samples) -> Float[Array, "n k"]:
     relaxing = [p for p in behind if isinstance(p, m.effects.AbstractEffect) and p.relaxation]
     late = [jnp.exp(-time / getattr(part, part.relaxation)) for part in relaxing]
     offset = jnp.concatenate([offset, *(one[:: samples.stride, None] for one in late)], axis=1)
-    if place is not None and (charging := _free_motions(stage.parts[:place], samples)) is not None:
-        charging = charging / (jnp.max(jnp.abs(charging), axis=0)[None] + _TINY)
-        powers = jnp.concatenate([charging**power for power in range(1, _POWERS + 1)], axis=1)
-        columns = answered(stage, place, samples, powers, ahead(stage, place, samples))
-        offset = jnp.concatenate([offset, columns], axis=1)
     swinging = _free_motions(behind, samples)
     return offset if swinging is None else jnp.concatenate([offset, swinging[:: samples.stride]], axis=1)
 
@@ -224,8 +232,8 @@ def joined(parts: Sequence[Any]) -> m.LinearSystem | None:
 
 @kept
 def ahead(stage: m.Stage, place: int, samples: Samples, rest_V: Float[Array, ""] | None = None) -> m.Signal:
-    """What goes into a part after a rest at the first command, or at another, at the refined times, `(m,)`."""
-    signal = m.Signal(samples.voltage_V, samples.voltage_V[0] if rest_V is None else rest_V, samples.hold)
+    """What goes into a part after the rest before the run, or after another, at the refined times, `(m,)`."""
+    signal = m.Signal(samples.voltage_V, samples.rest_V if rest_V is None else rest_V, samples.hold)
     scene = m.Scene(signal, samples.beside, samples.start.memory)
     return m.run_parts(stage.parts[:place], samples.time_s, signal, scene)
 
