@@ -8,13 +8,18 @@ from scipy import stats
 from fits.diagnosis._explanation import Selection
 from fits.diagnosis._prepare import Prepared
 from fits.diagnosis._refit import Refit, nothing, refit
-from fits.diagnosis._residual_tests import explain_together, repeats_in, run_regressors
+from fits.diagnosis._residual_tests import explain_together, is_flicker, repeats_in, run_regressors
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
+from fits.io._length import length
 from fits.stats._compare import improvement_z, is_worse
 from fits.stats._cycles import Cycles
 from fits.stats._noise import Noise
 from microid.effects import card_of
 
+_WANDERS = (
+    "the readings wander by {} beyond that noise, and with nothing that the rig did, as flicker noise of the sensor "
+    "or of its surroundings does, whose power falls as one over the frequency"
+)
 # A share below this is hardly any.
 SHOWN = 0.005
 
@@ -23,7 +28,8 @@ SHOWN = 0.005
 class Misfit:
     """What causes explain of a residual and what structure is left, as sums of squares in noise variances.
 
-    `freedom` is what chance gives the rest, and `count` the number of samples.
+    `freedom` is what chance gives the rest, and `count` the number of samples. What is no rest is `wander`, flicker
+    noise of that root mean square, in noise.
     """
 
     explained: float
@@ -31,6 +37,7 @@ class Misfit:
     freedom: int
     count: int
     thresholds: Thresholds = THRESHOLDS
+    wander: float = 0.0
 
     @property
     def total(self) -> float:
@@ -95,7 +102,14 @@ def worth_naming(
         misfit, repeated = _misfit(ready, told, rounded)
         doubts = [_doubt(told, name, misfit) for name in {cause.name: None for cause in found.causes}]
         if not any(doubts):
-            return found, told, misfit, repeated, said
+            wander_um = misfit.wander * told.first.unit_um(told.plain.residual)
+            return (
+                found,
+                told,
+                misfit,
+                repeated,
+                [*said, *([_WANDERS.format(length(wander_um))] if wander_um else [])],
+            )
         _, name, why = min(filter(None, doubts))
         said.append(f"{name.replace('_', ' ')} is not named: {why}")
         others = tuple(cause for cause in found.causes if cause.name != name)
@@ -160,4 +174,8 @@ def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, C
     rest, freedom = explain_together(found.projector, found.model.basis(), found.model.residual, regressors)
     repeated = repeats_in(found.projector, found.model.residual, ready.bench.plain)
     rest = max(rest, 0.0 if rounded else repeated.drop)
-    return Misfit(found.explained, rest, freedom, found.first.count, ready.reading.thresholds), repeated
+    misfit = Misfit(found.explained, rest, freedom, found.first.count, ready.reading.thresholds)
+    left = found.projector, found.model.basis(), found.model.residual
+    if misfit.is_left_over and is_flicker(*left, regressors, misfit.thresholds):
+        misfit = replace(misfit, rest=float(freedom), wander=misfit.rest_noise)
+    return misfit, repeated

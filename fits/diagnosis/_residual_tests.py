@@ -14,6 +14,7 @@ from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._run import Run
 from fits.stats._cycles import Cycles, cycles
+from fits.stats._flicker import Flicker
 from fits.stats._noise import learn_noise
 from fits.stats._score_test import standard_deviations
 
@@ -33,6 +34,8 @@ _SENTENCES = {
 }
 # Lags of neighbours, stretches of a run, and samples that a stretch needs at least.
 _LAGS, _STRETCHES, _FEWEST_IN_STRETCH = 20, 24, 20
+# What goes along the run, whatever the rig does, and the chance below which what goes with the rig is no noise.
+_ALONG_THE_RUN, _CHANCE = ("time", "gain", "jumps"), 1e-3
 # Evidence is counted up to so many standard deviations.
 _LARGEST_Z = 37.0
 
@@ -152,13 +155,8 @@ def explain(
     """Regress a residual on each, beside effects whose tangent `basis` spans."""
     found = []
     for regressors in groups:
-        joined = projector.off(np.stack([projector.join(column) for column in regressors.columns], axis=1))
-        joined -= basis @ (basis.T @ joined)
-        scale = np.linalg.norm(joined, axis=0) + 1e-300
-        left, size, _ = np.linalg.svd(joined / scale, full_matrices=False)
-        keep = size > 1e-6 * size[0]
-        along = left[:, keep].T @ residual
-        drop, freedom = float(along @ along), int(keep.sum())
+        along = _along(projector, basis, regressors).T @ residual
+        drop, freedom = float(along @ along), len(along)
         p, z = float(stats.chi2.sf(drop, freedom)), float(standard_deviations(drop, freedom))
         found.append(Explained(regressors, drop, freedom, z, p))
     return found
@@ -171,6 +169,42 @@ def explain_together(
     columns = tuple(column for regressors in groups for column in regressors.columns)
     (seen,) = explain(projector, basis, residual, [Regressors("together", columns, "")])
     return seen.drop, seen.freedom
+
+
+def is_flicker(
+    projector: Projector,
+    basis: np.ndarray,
+    residual: np.ndarray,
+    groups: Sequence[Regressors],
+    thresholds: Thresholds = THRESHOLDS,
+) -> bool:
+    """Whether flicker noise makes what is left, which then goes with nothing that the rig does.
+
+    What regressors explain of such noise is a weighted sum of squares, whose chance is that of one with the same mean
+    and variance (Satterthwaite, Biometrics Bulletin 2 (1946) 110). Along the run noise may wander a little faster.
+    """
+    parts = projector.split(residual)
+    noise, stops = list(map(Flicker.of, parts)), np.cumsum([len(part) for part in parts])
+    for regressors in groups:
+        along = _along(projector, basis, regressors)
+        drop = float(np.sum((along.T @ residual) ** 2))
+        spread = along[stops[-1] :].T @ along[stops[-1] :]
+        for one, each in zip(noise, np.split(along[: stops[-1]], stops[:-1]), strict=True):
+            spread = spread + each.T @ one.passed(each)
+        mean, square = float(np.trace(spread)), float(np.sum(spread**2))
+        chance = stats.chi2.sf(drop * mean / square, mean**2 / square)
+        if chance < (thresholds.rest_chance if regressors.name in _ALONG_THE_RUN else _CHANCE):
+            return False
+    return True
+
+
+def _along(projector: Projector, basis: np.ndarray, regressors: Regressors) -> np.ndarray:
+    """Orthonormal columns that span regressors, off the tangent of a baseline and of effects."""
+    joined = projector.off(np.stack([projector.join(column) for column in regressors.columns], axis=1))
+    joined -= basis @ (basis.T @ joined)
+    scale = np.linalg.norm(joined, axis=0) + 1e-300
+    left, size, _ = np.linalg.svd(joined / scale, full_matrices=False)
+    return np.asarray(left[:, size > 1e-6 * size[0]])
 
 
 def repeats_in(projector: Projector, residual: np.ndarray, plain_um: Sequence[np.ndarray]) -> Cycles:
