@@ -41,3 +41,15 @@ def test_what_columns_take_of_such_noise_is_foretold(rng):
         taken = np.mean([np.sum((basis.T @ one) ** 2) for one in draws])
         foretold = np.trace(basis.T @ Flicker(1.0, size).passed(basis))
         assert taken == pytest.approx(foretold, rel=0.15)
+
+
+def test_an_octave_with_a_resonance_in_it_is_no_flicker_noise(rng):
+    chances, count = [], 3000
+    for _ in range(200):
+        noise = rng.standard_normal(count) + relaxations(rng, count, 0.02)
+        chances.append(Flicker.of(noise).chance(noise))
+    # Octaves are not quite independent of the fit: as many or fewer are improbable than are said to be.
+    assert np.mean(np.array(chances) < 0.05) < 0.15
+    ringing = lfilter([0.15], [1.0, -2 * 0.98 * np.cos(0.2), 0.98**2], rng.standard_normal(count))
+    found = noise + ringing
+    assert Flicker.of(found).chance(found) < 1e-3

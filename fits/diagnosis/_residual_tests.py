@@ -185,6 +185,8 @@ def is_flicker(
     """
     parts = projector.split(residual)
     noise, stops = list(map(Flicker.of, parts)), np.cumsum([len(part) for part in parts])
+    if min(one.chance(part) for one, part in zip(noise, parts, strict=True)) < _CHANCE:
+        return False
     for regressors in groups:
         along = _along(projector, basis, regressors)
         drop = float(np.sum((along.T @ residual) ** 2))
