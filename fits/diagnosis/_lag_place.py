@@ -22,6 +22,8 @@ _MOSTLY = 0.5
 _NOISE = 0.05
 # So many effects beside a lag are fitted.
 _TRIED = 2
+# Damping ratios from its frequency within which a mode answers.
+_NEAR = 2.0
 # So many time constants after the first sample a lag has settled.
 _SETTLED = 8
 
@@ -93,6 +95,30 @@ def rings(plain: PlainFit) -> bool:
     """Whether the stage has a mode, and that rings."""
     modes = named_parts(plain.regression.baseline.stage, Mechanics)
     return bool(modes) and all(float(mode.damping_ratio) <= _RINGS for _, mode in modes)
+
+
+def rings_by_command(plain: PlainFit) -> bool:
+    """Whether the stage has modes that ring, and that the command itself moves by more than noise.
+
+    Overtones of a slow sine, which only the hysteresis makes, are followed by any mode among them.
+    """
+    modes = named_parts(plain.regression.baseline.stage, Mechanics)
+    return rings(plain) and all(_is_moved(mode, plain) for _, mode in modes)
+
+
+def _is_moved(mode: Mechanics, plain: PlainFit) -> bool:
+    """Whether what a mode makes of a command near its frequency, by the gain at rest, exceeds the noise of a run."""
+    baseline, damping = plain.regression.baseline, float(mode.damping_ratio)
+    most = baseline.stroke_um / np.ptp(baseline.range_V) / (2 * damping)
+    for run, noise in zip(baseline.runs, plain.faults.noise, strict=True):
+        voltage_V, window = run.record.voltage_V, np.hanning(len(run.record))
+        spectrum = np.fft.rfft((voltage_V - voltage_V.mean()) * window) / np.sqrt(np.mean(window**2))
+        off = np.abs(np.fft.rfftfreq(len(voltage_V), 1 / run.rate_Hz) / float(mode.natural_frequency_Hz) - 1)
+        near = off < max(_NEAR * damping, 1.001 * off.min())
+        rms_V = float(np.sqrt(2 * np.sum(np.abs(spectrum[near]) ** 2))) / len(voltage_V)
+        if rms_V * most > noise.total_um:
+            return True
+    return False
 
 
 def _beside_lags(plain: PlainFit) -> list[Refit]:

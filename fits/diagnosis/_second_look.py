@@ -9,7 +9,7 @@ from fits.diagnosis._comparison import criterion
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Selection
 from fits.diagnosis._extension import shared_effects
-from fits.diagnosis._lag_place import rings
+from fits.diagnosis._lag_place import rings_by_command
 from fits.diagnosis._noise import find_faults
 from fits.diagnosis._prepare import Prepared, Reading, decide_plain_stage, fit_plain_stage, prepared
 from fits.diagnosis._refit import refit
@@ -36,7 +36,7 @@ def look_again(
     progress("fitting the plain stage again, to what the largest cause leaves")
     try:
         there = fit_plain_stage(cleaned, tuple(run.hold for run in ready.baseline.runs), progress)
-        if not (rings(there) and has_time()):
+        if not (rings_by_command(there) and has_time()):
             return None
         cleaned, there, said = decide_plain_stage(cleaned, progress, has_time, there.regression.baseline.problem)
         reading = replace(ready.reading, fraction=cleaned.fraction)
@@ -46,7 +46,7 @@ def look_again(
         return None
     baseline, beside = plain.regression.baseline, there.regression.baseline
     alike = [type(part) for part in baseline.stage.parts] == [type(part) for part in beside.stage.parts]
-    if not (rings(there) and alike) or len(baseline.columns_um) != len(beside.columns_um):
+    if not (rings_by_command(there) and alike) or len(baseline.columns_um) != len(beside.columns_um):
         return None
     z = np.asarray(baseline.chain.coordinates.of(beside.stage))
     moved = replace(baseline, z=z, columns_um=beside.columns_um, prior=beside.prior, hyper=beside.hyper)
