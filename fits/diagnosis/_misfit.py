@@ -29,7 +29,7 @@ class Misfit:
     """What causes explain of a residual and what structure is left, as sums of squares in noise variances.
 
     `freedom` is what chance gives the rest, and `count` the number of samples. What is no rest is `wander`, flicker
-    noise of that root mean square, in noise.
+    noise of that root mean square, in noise; with no cause named, all is where the whole `wanders`.
     """
 
     explained: float
@@ -38,6 +38,7 @@ class Misfit:
     count: int
     thresholds: Thresholds = THRESHOLDS
     wander: float = 0.0
+    wanders: bool = False
 
     @property
     def total(self) -> float:
@@ -72,6 +73,8 @@ class Misfit:
         What is beyond chance counts, however small it is, unless nearly all of the rest is of another kind.
         """
         rest = (max(self.explained + self.excess, 0.0) / self.count) ** 0.5
+        if self.wanders:
+            return rest, False
         return rest, rest > self.thresholds.rest_noise or not (weak or self.share < self.thresholds.minor_share)
 
 
@@ -177,5 +180,7 @@ def _misfit(ready: Prepared, found: Selection, rounded: bool) -> tuple[Misfit, C
     misfit = Misfit(found.explained, rest, freedom, found.first.count, ready.reading.thresholds)
     left = found.projector, found.model.basis(), found.model.residual
     if misfit.is_left_over and is_flicker(*left, regressors, misfit.thresholds):
-        misfit = replace(misfit, rest=float(freedom), wander=misfit.rest_noise)
+        plain = found.first, np.zeros((len(found.plain.residual), 0)), found.plain.residual
+        wanders = is_flicker(*plain, regressors, misfit.thresholds)
+        misfit = replace(misfit, rest=float(freedom), wander=misfit.rest_noise, wanders=wanders)
     return misfit, repeated
