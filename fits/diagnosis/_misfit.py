@@ -105,14 +105,9 @@ def worth_naming(
         misfit, repeated = _misfit(ready, told, rounded)
         doubts = [_doubt(told, name, misfit) for name in {cause.name: None for cause in found.causes}]
         if not any(doubts):
-            wander_um = misfit.wander * told.first.unit_um(told.plain.residual)
-            return (
-                found,
-                told,
-                misfit,
-                repeated,
-                [*said, *([_WANDERS.format(length(wander_um))] if wander_um else [])],
-            )
+            if misfit.wander:
+                said.append(_WANDERS.format(length(misfit.wander * told.first.unit_um(told.plain.residual))))
+            return found, told, misfit, repeated, said
         _, name, why = min(filter(None, doubts))
         said.append(f"{name.replace('_', ' ')} is not named: {why}")
         others = tuple(cause for cause in found.causes if cause.name != name)
