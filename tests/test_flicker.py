@@ -1,9 +1,14 @@
 """Flicker noise, from many relaxations of all time constants, and what is told from it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from fits import Record
+from fits.diagnosis._residual_tests import is_flicker, run_regressors
+from fits.loop._run import prepare_run
 from fits.stats._flicker import Flicker
 
 
@@ -53,3 +58,27 @@ def test_an_octave_with_a_resonance_in_it_is_no_flicker_noise(rng):
     ringing = lfilter([0.15], [1.0, -2 * 0.98 * np.cos(0.2), 0.98**2], rng.standard_normal(count))
     found = noise + ringing
     assert Flicker.of(found).chance(found) < 1e-3
+
+
+def test_what_goes_with_the_position_is_no_flicker_noise(rng):
+    """Four loops, and a curve along each branch of as large a mean square as the noise wanders by, or none."""
+    count, size = 3000, 0.02
+    time_s = np.arange(count) / 1000.0
+    voltage_V = 50 - 45 * np.cos(2 * np.pi * 4 * time_s / time_s[-1])
+    place_um = 0.3 * voltage_V
+    run = prepare_run(Record(time_s, voltage_V, place_um), (5.0, 95.0), "negative", 0.0)
+    groups = run_regressors([run], [place_um])
+    bare = SimpleNamespace(split=lambda joined: [joined], off=lambda joined: joined, join=np.concatenate)
+    nothing = np.zeros((count, 0))
+    up = np.gradient(voltage_V) >= 0
+    curve = np.where(up, 1.0, -1.0) * np.sin(np.pi * (voltage_V - 5) / 90) - 0.3 * np.cos(np.pi * voltage_V / 45)
+    found = []
+    for _ in range(40):
+        wander = relaxations(rng, count, size)
+        noise = rng.standard_normal(count) + wander
+        errors = noise + curve * np.std(wander) / np.std(curve)
+        found.append([is_flicker(bare, nothing, one - one.mean(), groups) for one in (noise, errors)])
+    alone, beside = np.mean(found, axis=0)
+    print(alone, beside)
+    assert alone > 0.7
+    assert beside < 0.05
