@@ -18,6 +18,8 @@ from microid import Driver, Mechanics, Stage
 
 # Gains that differ by more than this are not those of one rig.
 _REFUSED = 0.1
+# The same before anything is fitted.
+_CLEARLY = 0.5
 # Part of a range of voltage that counts as all of it.
 _WHOLE = 0.95
 # A resonance above this fraction of the sampling rate is hardly told from its mirror image.
@@ -44,8 +46,9 @@ def refuse_slopes(records: Sequence[Record]) -> None:
     for (one, high, fast), (other, low, slow) in permutations(full, 2):
         # Where a run rings it reaches farther, but not on average.
         ratio = min(high / low, _slope(one) / max(_slope(other), 1e-300))
-        # What is faster may move less far because of the dynamics, which are not known yet.
-        if ratio > 1 + _REFUSED and max(fast, slow) < 1.5 * min(fast, slow):
+        # What is faster may move less far because of the dynamics, and small loops do so because of the hysteresis,
+        # neither of which is known yet.
+        if ratio > 1 + _CLEARLY and max(fast, slow) < 1.5 * min(fast, slow):
             raise DataError(_not_one_rig(one.source, other.source, ratio))
 
 
