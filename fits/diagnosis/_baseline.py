@@ -16,8 +16,8 @@ from fits.loop._choose_grid import choose_grid
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, pasts_to_estimate, prepare_run
+from fits.stage._began import as_begun
 from fits.stage._chain import Chain
-from fits.stage._charge import with_charges
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._fit import default_stage, solve_stage
 from fits.stage._motion import at_samples, prepare, signals
@@ -158,12 +158,11 @@ def fit_baseline(
     records, aside = with_paths(records, aside)
     settings = holdout, initial, progress, holds, better
     found = _fitted(records, aside, *settings, onward, left_out)
-    charged = with_charges(found.stage, (*found.runs, *found.aside))
-    same = (one.charged_V == run.charged_V for one, run in zip(charged, (*records, *aside), strict=True))
-    if not found.dynamic or all(same):
+    begun = as_begun(found.stage, (*found.runs, *found.aside)) if found.dynamic else []
+    if not any(one.charged_V or one.before_V for one in begun):
         return found
-    progress("again with what the driver was charged with before the runs")
-    return _fitted(charged[: len(records)], charged[len(records) :], *settings, found.problem, left_out)
+    progress("again with what went on before the runs")
+    return _fitted(begun[: len(records)], begun[len(records) :], *settings, found.problem, left_out)
 
 
 def _fitted(

@@ -39,9 +39,10 @@ class Record(AbstractSummary):
     displacements in um, or None for a voltage programme, shape (n,) each. `extra` holds all other numeric columns by
     name, each of shape (n,), such as ``temperature_degC``; `source` is the name of the file, without its folder, and
     `warnings` say what looked odd when it was read, one sentence each; what cannot be printed of them is kept as
-    codes. By `charged_V` the driver of the rig was ahead of the first command when the record began. A `DataError`
-    says that the arrays are not one-dimensional or differ in length, that one of the three holds what is no finite
-    number, or that times do not increase.
+    codes. By `charged_V` the driver of the rig was ahead of the first command when the record began, and
+    `before_V` are the extremes that its hysteresis remembered then, oldest first, as far as they are known. A
+    `DataError` says that the arrays are not one-dimensional or differ in length, that one of the three holds what is
+    no finite number, or that times do not increase.
     """
 
     time_s: FloatArray
@@ -51,6 +52,7 @@ class Record(AbstractSummary):
     source: str = ""
     warnings: tuple[str, ...] = ()
     charged_V: float = 0.0
+    before_V: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         extra = {name: read_only(name, values) for name, values in self.extra.items()}

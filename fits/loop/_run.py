@@ -238,7 +238,7 @@ def prepare_run(
         )
     ahead = 1.0 if gain is None else gain
     lower, upper = ahead * lower, ahead * upper
-    start = initial_state(initial, lower, upper)
+    start = initial_state(record.before_V if unknown and record.before_V else initial, lower, upper)
     return Run(record, lower, upper, start, known, fitted, None, ahead, stride, hold, unknown, has_past)
 
 

@@ -21,7 +21,7 @@ from fits.loop._result import FitError, FitResult, FitStatus, RunReport
 from fits.loop._run import MOST, PAST_IS_ESTIMATED, Progress, Run, pasts_to_estimate, prepare_run
 from fits.loop._stepped import refuse_many_steps
 from fits.stage._before import memory_before
-from fits.stage._charge import with_charges
+from fits.stage._began import as_begun
 from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._lag_place import placed_onward
@@ -102,11 +102,11 @@ def fit_stage(
     """
     records, holdout = records_given(records), holdout_given(holdout)
     found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
-    charged = with_charges(found.solved.stage, found.solved.runs) if found.failure is None else records
-    if any(one.charged_V != record.charged_V for one, record in zip(charged, records, strict=True)):
-        progress("again with what the driver was charged with before the runs")
-        records, begun = charged, found.solved.onward
-        found = solve_stage(records, stage, levels, holdout, initial, loss, progress, onward=begun)
+    begun = as_begun(found.solved.stage, found.solved.runs) if found.failure is None else []
+    if any(one.charged_V or one.before_V for one in begun):
+        progress("again with what went on before the runs")
+        records, onward = begun, found.solved.onward
+        found = solve_stage(records, stage, levels, holdout, initial, loss, progress, onward=onward)
     solved, runs = found.solved, found.solved.runs
     left, simplified = misfits(runs, solved.residuals_um), solved.problem.least_noise_share > 0
     progress("looking for delays")

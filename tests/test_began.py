@@ -9,7 +9,7 @@ from scipy.signal import lsim
 import microid as m
 from fits import Record
 from fits.loop._run import prepare_run
-from fits.stage._charge import with_charges
+from fits.stage._began import as_begun
 
 RATE_Hz, COUNT, PARTS, NOISE = 2000.0, 1500, 4, 1e-4
 
@@ -32,8 +32,8 @@ def test_the_voltage_behind_the_driver_is_found(rng, share):
     run = prepare_run(
         Record(fine_s[::PARTS], command_V[::PARTS], read_um), (lower, upper), "unknown", 0.0, 2, estimated=True
     )
-    [found] = with_charges(stage, [run])
+    [found] = as_begun(stage, [run])
     assert found.charged_V == pytest.approx(share * span, abs=0.02 * span)
     # A record that says so already is left as it is.
-    [again] = with_charges(stage, [prepare_run(found, (lower, upper), "unknown", 0.0, 2, estimated=True)])
+    [again] = as_begun(stage, [prepare_run(found, (lower, upper), "unknown", 0.0, 2, estimated=True)])
     assert again.charged_V == pytest.approx(found.charged_V, abs=1e-3 * span)

@@ -1,0 +1,119 @@
+"""What went on before a run: what the driver was charged with when it began, and what the hysteresis remembered."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import qr
+from scipy.optimize import minimize_scalar
+
+import microid as m
+from fits.io._record import Record
+from fits.loop._run import Run, prepare_run
+from fits.stage._before import memory_before
+from fits.stage._run import (
+    nuisance_columns,
+    place_of_hysteresis,
+    residual_of,
+    respond,
+    settled_columns,
+    simulate_stage,
+)
+
+# Voltages that are tried over the range, the part of their distance to which the best is found, and how much larger
+# the Bayesian information criterion must be without.
+_TRIED, _FINE, _LEAST = 25, 1e-3, 10.0
+# Part of a column beside the others below which it is rounding.
+_DEPENDENT = 1e-10
+# Mean square that is left where the past counts, over that later, from which on it is looked into, and the part of a
+# run that is later at least.
+_MORE, _LATER = 1.1, 0.1
+
+
+def as_begun(stage: m.Stage, runs: Sequence[Run]) -> list[Record]:
+    """The records of runs with what went on before them, where that explains more of them.
+
+    A hysteresis keeps what the voltage behind the driver went through, and not what the command did. What is unknown
+    of that is estimated beside the rest, but as smooth, which it is not where it turned.
+    """
+    place = place_of_hysteresis(stage)
+    driven = any(isinstance(m.innermost(part), m.Driver) for part in stage.parts[:place])
+    if place is None or not driven:
+        return [run.record for run in runs]
+    return [_begun(stage, run) if run.moving and run.has_past else run.record for run in runs]
+
+
+def _begun(stage: m.Stage, run: Run) -> Record:
+    left_um, later = residual_of(stage, run), _later(run)
+    early = run.fitted & ~later
+    if not early.any() or np.mean(left_um[early] ** 2) < _MORE * np.mean(left_um[later] ** 2):
+        return run.record
+    charged = _anew(run, charged_V=_charge_V(stage, run))
+    others = [charged, *(_anew(one, before_V=_before_V(stage, one)) for one in (run, charged))]
+    best = min((run, *others), key=lambda one: _criterion(stage, one))
+    return best.record if _criterion(stage, best) < _criterion(stage, run) - _LEAST else run.record
+
+
+def _later(run: Run) -> np.ndarray:
+    """Samples that are fitted and depend on no unknown past, shape `(n,)`; the last ones where all do."""
+    index = np.arange(len(run.record))
+    later = run.fitted & (index >= run.of_past)
+    last = np.flatnonzero(run.fitted)[-max(int(_LATER * run.fitted.sum()), 1) :]
+    return later if later.sum() > len(last) else run.fitted & (index >= last[0])
+
+
+def _anew(run: Run, **before: float | tuple[float, ...]) -> Run:
+    """The same run after something else."""
+    record = replace(run.record, **before)  # type: ignore[arg-type]
+    ends_V = run.lower_V / run.gain, run.upper_V / run.gain
+    begun = prepare_run(record, ends_V, "unknown", 0.0, run.stride, run.gain, run.hold, None, True)
+    return replace(run, record=record, start=begun.start)
+
+
+def _criterion(stage: m.Stage, run: Run) -> float:
+    """Bayesian information criterion of what is known to have been before a run, its noise unknown."""
+    left_um = residual_of(stage, run)[run.fitted]
+    known = len(run.record.before_V) + (run.record.charged_V != 0)
+    return float(len(left_um) * np.log(np.sum(left_um**2) + 1e-300) + known * np.log(len(left_um)))
+
+
+def _before_V(stage: m.Stage, run: Run) -> tuple[float, ...]:
+    """Extremes that the hysteresis remembered, at it, by what is left where the past counts."""
+    later, left_um, alone_um = _later(run), residual_of(stage, run), simulate_stage(stage, run)
+    offset_um = float(np.mean((run.displacement_um - left_um - alone_um)[later]))
+    found = memory_before(stage, run, alone_um + offset_um, float(np.std(left_um[later])))
+    return tuple(np.asarray(found.extremes_V)[: int(found.count)].tolist())
+
+
+def _charge_V(stage: m.Stage, run: Run) -> float:
+    """By how much the voltage behind the driver was ahead of the first command; as the record has it by default."""
+    samples, record = run.coarser.samples, run.record
+    root = np.sqrt(np.asarray(samples.weight))
+    columns = settled_columns(stage, samples), nuisance_columns(stage, samples)
+    plain, powers = (_spanned(root[:, None] * np.asarray(each)) for each in columns)
+
+    def left(rest_V: float, beside: np.ndarray = plain) -> float:
+        """Sum of squares that the stage leaves after a rest, in um^2."""
+        rest = jnp.asarray(rest_V)
+        begun = replace(samples, rest_V=rest, start=replace(samples.start, rest_V=rest))
+        off = root * np.asarray(samples.displacement_um - respond(stage, begun))
+        off -= beside @ (beside.T @ off)
+        return float(off @ off)
+
+    grid_V = np.linspace(run.lower_V, run.upper_V, _TRIED) / run.gain
+    best_V, step_V = min(grid_V, key=left), grid_V[1] - grid_V[0]
+    around_V = max(best_V - step_V, grid_V[0]), min(best_V + step_V, grid_V[-1])
+    found = minimize_scalar(left, bounds=around_V, method="bounded", options={"xatol": _FINE * step_V})
+    # What it was charged with may hardly bend its way, and then its powers do as well.
+    now = left(record.voltage_V[0] + record.charged_V, powers)
+    if run.fitted.sum() * np.log(now / float(found.fun)) < _LEAST:
+        return record.charged_V
+    return float(found.x) - float(record.voltage_V[0])
+
+
+def _spanned(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span the same, shape `(n, r)`."""
+    size = np.linalg.norm(columns, axis=0)
+    basis, upper, _ = qr(columns[:, size > 0] / size[size > 0], mode="economic", pivoting=True)
+    return basis[:, np.abs(np.diagonal(upper)) > _DEPENDENT]
