@@ -83,10 +83,23 @@ class Left:
 )
 def test_when_a_driver_is_taken_in_place_of_what_else_may_lag(monkeypatch, driver, plain, taken):
     monkeypatch.setattr(_lag_place, "_beside_lags", lambda fit: [fit.beside])
-    monkeypatch.setattr(_lag_place, "alternate", lambda *settings: [SimpleNamespace(cost=settings[-1])])
+    beside = Left(plain.beside).left
+    monkeypatch.setattr(_lag_place, "alternate", lambda *_: [None, None, SimpleNamespace(residual=beside)])
+    monkeypatch.setattr(_lag_place, "_left_later", lambda _, residual, __: float(residual @ residual))
+    monkeypatch.setattr(_lag_place, "lag_of", lambda fit: 0.01)
     monkeypatch.setattr(_lag_place, "_left_beside_two", lambda fit: fit.beside)
     monkeypatch.setattr(_lag_place, "_is_damped", lambda fit: fit.damped)
     assert _lag_place.is_of_driver(driver, plain, THRESHOLDS) == taken
+
+
+def test_what_a_lag_began_with_does_not_count():
+    """Two runs of 100 samples, of which every second counts, with a lag of three samples."""
+    run = SimpleNamespace(record=SimpleNamespace(time_s=5.0 + 0.01 * np.arange(100)))
+    regression = SimpleNamespace(baseline=SimpleNamespace(runs=[run, run]))
+    counts = np.arange(100) % 2 == 0
+    projector = SimpleNamespace(regression=regression, masks=[counts, counts], split=lambda both: np.split(both, 2))
+    residual = np.where(0.02 * np.arange(50) > 8 * 0.03, 1.0, 100.0)
+    assert _lag_place._left_later(projector, np.r_[residual, residual], 0.03) == 2 * np.sum(residual == 1)
 
 
 @pytest.mark.study
