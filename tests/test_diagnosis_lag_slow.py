@@ -93,13 +93,13 @@ def test_when_a_driver_is_taken_in_place_of_what_else_may_lag(monkeypatch, drive
 
 
 def test_what_a_lag_began_with_does_not_count():
-    """Two runs of 100 samples, of which every second counts, with a lag of three samples."""
+    """Two runs of 100 samples, of which every second counts, with a lag of about three samples."""
     run = SimpleNamespace(record=SimpleNamespace(time_s=5.0 + 0.01 * np.arange(100)))
     regression = SimpleNamespace(baseline=SimpleNamespace(runs=[run, run]))
     counts = np.arange(100) % 2 == 0
     projector = SimpleNamespace(regression=regression, masks=[counts, counts], split=lambda both: np.split(both, 2))
-    residual = np.where(0.02 * np.arange(50) > 8 * 0.03, 1.0, 100.0)
-    assert _lag_place._left_later(projector, np.r_[residual, residual], 0.03) == 2 * np.sum(residual == 1)
+    residual = np.where(0.02 * np.arange(50) > 8 * 0.031, 1.0, 100.0)
+    assert _lag_place._left_later(projector, np.r_[residual, residual], 0.031) == 2 * np.sum(residual == 1)
 
 
 @pytest.mark.study
