@@ -1,4 +1,4 @@
-"""What a driver was still charged with when a record was cut from a drive, which SciPy plays."""
+"""What went on before a record that was cut from a drive: the charge of a driver, and where the rig had turned."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +10,7 @@ import microid as m
 from fits import Record
 from fits.loop._run import prepare_run
 from fits.stage._began import as_begun
+from fits.stage._run import residual_of
 
 RATE_Hz, COUNT, PARTS, NOISE = 2000.0, 1500, 4, 1e-4
 
@@ -37,3 +38,26 @@ def test_the_voltage_behind_the_driver_is_found(rng, share):
     # A record that says so already is left as it is.
     [again] = as_begun(stage, [prepare_run(found, (lower, upper), "unknown", 0.0, 2, estimated=True)])
     assert again.charged_V == pytest.approx(found.charged_V, abs=1e-3 * span)
+
+
+def test_where_the_hysteresis_had_turned_before_is_found(rng):
+    """A growing swing passes, one by one, what the rig had turned at before, where no smooth past turns."""
+    model = random_model(rng, 24)
+    lower, upper = limits_V(model)
+    span, time_s = upper - lower, np.arange(COUNT) / RATE_Hz
+    stage = m.Stage.of(driver=m.Driver(1e-6), hysteresis=model)
+    command_V = lower + span * (0.5 + np.sin(2 * np.pi * 8 * time_s) * (0.02 + 0.45 * time_s / time_s[-1]))
+    closing = np.sort(rng.uniform(0.02, 0.45, 6))
+    shares = np.stack([1 - closing, closing + rng.uniform(0, 0.02, 6)], axis=1).ravel()
+    path_V = np.concatenate([[lower], lower + span * shares, command_V])
+    read_um = np.array(model(jnp.asarray(path_V)))[-COUNT:]
+    read_um += NOISE * np.std(read_um) * rng.standard_normal(COUNT)
+    run = run_of(Record(time_s, command_V, read_um), lower, upper)
+    after = run_of(*as_begun(stage, [run]), lower, upper)
+    before_um, left_um = residual_of(stage, run), residual_of(stage, after)
+    assert after.record.before_V
+    assert np.std(left_um) < 0.5 * np.std(before_um)
+
+
+def run_of(record, lower, upper):
+    return prepare_run(record, (lower, upper), "unknown", 0.0, 1, estimated=True)
