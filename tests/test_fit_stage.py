@@ -268,24 +268,6 @@ def test_a_first_way_from_elsewhere_is_no_other_rig():
             refuse_slopes(pair)
 
 
-def test_small_loops_beside_a_resonance_are_no_other_rig():
-    """Small loops move less per volt, and a run near the resonance more: together by more than a tenth."""
-    time_s = np.arange(4000) / 1000.0
-    ring = np.exp(-(((time_s - 2) / 0.2) ** 2)) * np.sin(2 * np.pi * 80 * time_s)
-    decaying_V = 50 - 50 * (1 - 0.9 * time_s / 4) * np.cos(2 * np.pi * 8 * time_s)
-    full_V = 50 - 47 * np.cos(2 * np.pi * 8 * time_s) + 3 * ring
-    moved = []
-    for voltage_V, rung_um in ((decaying_V, 0.0), (full_V, 3 * ring)):
-        played_V = [voltage_V[0]]
-        for now_V in voltage_V[1:]:
-            played_V.append(np.clip(played_V[-1], now_V - 25, now_V + 25))
-        moved.append(Record(time_s, voltage_V, 0.1 * voltage_V + 0.1 * np.array(played_V) + rung_um))
-    slopes = [np.polyfit(one.voltage_V, one.displacement_um, 1)[0] for one in moved]
-    assert slopes[1] > 1.1 * slopes[0]
-    assert np.ptp(moved[1].displacement_um) > 1.1 * np.ptp(moved[0].displacement_um)
-    refuse_slopes(moved)
-
-
 @pytest.mark.study
 def test_runs_of_different_rigs_are_refused(rig):
     fast = rig.records["fast"]

@@ -1,5 +1,7 @@
 """Fast runs behind a lag, which begin in the middle of their motion and never get to the ends of their command."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -90,8 +92,8 @@ def test_a_diagnosis_does_not_advise_itself(hidden_by_a_lag, monkeypatch):
         fits.fit_stage(hidden_by_a_lag, levels=8)
 
     monkeypatch.setattr(_baseline, "solve_stage", refused)
-    monkeypatch.setattr(_baseline, "_static", lambda *given: given[-2])
-    (remark,) = _baseline.fit_baseline(fits.read_runs(hidden_by_a_lag), [], 0.2, "negative", print)
+    monkeypatch.setattr(_baseline, "_static", lambda *given: SimpleNamespace(dynamic=False, remarks=given[-2]))
+    (remark,) = _baseline.fit_baseline(fits.read_runs(hidden_by_a_lag), [], 0.2, "negative", print).remarks
     assert "taken as quasi-static: fast.csv: sampled at" in remark
     assert remark.endswith("sample at 5 times the resonance or more")
 

@@ -46,7 +46,7 @@ class DriverSaturation(AbstractEffect):
     source: ClassVar[str] = "rails at 95 to 103 % of the nominal range under load (estimate)"
     column: ClassVar[str] = "drive_monitor_V"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
-    gain_beyond: Float[Array, ""] = param(default=0.0, unit="1", scale=0.1, lower=0.0)
+    gain_beyond: Float[Array, ""] = param(default=0.0, unit="1", lower=0.0, upper=1.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -56,13 +56,15 @@ class DriverSaturation(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is above the rail."""
-        values, before = (jnp.minimum(x, _beyond(self, x)) for x in (signal.values, signal.before))
+        beyond = [(x, _beyond(self, x)) for x in (signal.values, signal.before)]
+        # Where both are computed anew, as compilers do, neither need equal their minimum, which has no slope then.
+        values, before = (jnp.where(x < y, x, y) for x, y in beyond)
         return signal.with_values(values, before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Cut off what is above the rail."""
-        rail_V: Any = self.rail_V
-        values, before = (np.where(x.real < rail_V.real, x, _beyond(self, x)) for x in (signal.values, signal.before))
+        beyond = [(x, _beyond(self, x)) for x in (signal.values, signal.before)]
+        values, before = (np.where(x.real < y.real, x, y) for x, y in beyond)
         return signal._replace(values=values, before=before)
 
 
@@ -91,7 +93,7 @@ class LowerDriverSaturation(AbstractEffect):
     source: ClassVar[str] = DriverSaturation.source
     column: ClassVar[str] = "drive_monitor_V"
     rail_V: Float[Array, ""] = param(unit="V", scale=10.0)
-    gain_beyond: Float[Array, ""] = param(default=0.0, unit="1", scale=0.1, lower=0.0)
+    gain_beyond: Float[Array, ""] = param(default=0.0, unit="1", lower=0.0, upper=1.0)
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -101,13 +103,14 @@ class LowerDriverSaturation(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Cut off what is below the rail."""
-        values, before = (jnp.maximum(x, _beyond(self, x)) for x in (signal.values, signal.before))
+        beyond = [(x, _beyond(self, x)) for x in (signal.values, signal.before)]
+        values, before = (jnp.where(x > y, x, y) for x, y in beyond)
         return signal.with_values(values, before)
 
     def in_numpy(self, interval_s: np.ndarray, signal: _NumpySignal) -> _NumpySignal:
         """Cut off what is below the rail."""
-        rail_V: Any = self.rail_V
-        values, before = (np.where(x.real > rail_V.real, x, _beyond(self, x)) for x in (signal.values, signal.before))
+        beyond = [(x, _beyond(self, x)) for x in (signal.values, signal.before)]
+        values, before = (np.where(x.real > y.real, x, y) for x, y in beyond)
         return signal._replace(values=values, before=before)
 
 
