@@ -41,7 +41,7 @@ def test_a_cyclic_error_is_read_where_the_past_has_put_the_stage(rng):
         runs.append(Record(time, drive_V, read_um, source=source))
     found = diagnose(runs)
     print(amplitude_um, second, period_um, found.summary())
-    # The past is estimated as smooth: on four rigs 2, 7, 0 and 10 % were missing, on two of them 4 nm unexplained, and
+    # The past is estimated as smooth: on four rigs 2, 7, 0 and 10 % were missing, on two of them 4 nm unexplained;
     # one had a further cause.
     [cause] = [one for one in found.causes if one.name == "cyclic_error"]
     values = {one.name: one.value for one in cause.parameters}
