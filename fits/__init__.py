@@ -77,12 +77,13 @@ if TYPE_CHECKING:
     from fits.report._diagnosis import report_html
     from fits.report._diagnosis_json import diagnosis_json, diagnosis_schema
     from fits.stage._distortion import NonlinearResponse, estimate_nonlinear_response
-    from fits.stage._fit import default_stage, fit_stage
+    from fits.stage._fit import fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._frequency import Multisine, ResponseData, estimate_response, read_multisine, read_response
     from fits.stage._modal_fit import ModalFit, fit_hysteresis, fit_response, relative_error
     from fits.stage._model_file import ModelFile, load_model, save_model
     from fits.stage._posterior import Draws, Profile, profile_stage, sample_posterior
+    from fits.stage._solve_stage import default_stage
     from fits.stage._uncertainty import StageUncertainty, draw_plants, predict
     from fits.stats._metrics import Errors, errors
     from fits.stats._noise_spectrum import NoiseBand, NoiseLine

@@ -22,8 +22,8 @@ from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._chain import Chain, offsets_out
-from fits.stage._fit import default_stage
 from fits.stage._run import place_of_hysteresis
+from fits.stage._solve_stage import default_stage
 from fits.stats._noise import Noise
 from microid import Sensor
 from microid.effects import EFFECTS

@@ -17,7 +17,7 @@ from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_wor
 from fits.diagnosis._misfit import Misfit
 from fits.diagnosis._prepare import Prepared, _covered
 from fits.diagnosis._result import Gain
-from fits.stage._fit import default_stage
+from fits.stage._solve_stage import default_stage
 from fits.stats._compare import improvement_z
 from fits.stats._held import _regressed, _stretches_at_rest
 from microid.effects import EFFECTS

@@ -20,8 +20,8 @@ from fits.diagnosis._regression import regress, saturating
 from fits.loop._design import Grid
 from fits.loop._run import prepare_run
 from fits.stage._chain import Chain, offsets_out
-from fits.stage._fit import default_stage
 from fits.stage._run import place_of_hysteresis
+from fits.stage._solve_stage import default_stage
 from fits.stats._noise import Noise
 from microid.effects.backlash import Backlash
 from microid.effects.clock_mismatch import ClockMismatch

@@ -9,7 +9,7 @@ from _models import compiled, random_model
 from scipy import integrate, signal
 
 import microid as m
-from fits.stage._fit import default_stage
+from fits.stage._solve_stage import default_stage
 from microid import effects as fx
 from microid._part import Scene, Signal
 

@@ -10,7 +10,7 @@ from scipy import signal
 
 import fits
 import microid as m
-from fits.stage._fit import default_stage
+from fits.stage._solve_stage import default_stage
 
 RATE_Hz, FINE, SAMPLES = 5000.0, 8, 1600
 LAG_s, NATURAL_Hz, DAMPING = 0.9e-3, 260.0, 0.12

@@ -52,12 +52,13 @@ if TYPE_CHECKING:
     from fits.report._machining import budget_json, sensitivity_json
     from fits.report._model_words import model_kind, model_numbers, model_words
     from fits.report._page import write_page
-    from fits.stage._fit import default_stage, fit_stage
+    from fits.stage._fit import fit_stage
     from fits.stage._fit_slow import fit_slow
     from fits.stage._model_file import ModelFile, load_model, model_text
     from fits.stage._motion import predicted_ranges
     from fits.stage._plain_stage import plain_model
     from fits.stage._run import yields_inside
+    from fits.stage._solve_stage import default_stage
     from fits.stage._uncertainty import draw_plants, predict
     from fits.sweeps._run import run_sweep
     from fits.sweeps._show import describe_sweep, summarise

@@ -19,10 +19,10 @@ from fits.loop._run import Run, pasts_to_estimate, prepare_run
 from fits.stage._began import as_begun
 from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
-from fits.stage._fit import default_stage, solve_stage
 from fits.stage._motion import at_samples, prepare, signals
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, prior_precision
+from fits.stage._solve_stage import default_stage, solve_stage
 from fits.stats._noise import rough_noise_um
 from microid import Driver, Hold, Mechanics, Preisach, Stage
 from microid.effects import AbstractEffect, extend, host

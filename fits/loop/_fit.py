@@ -19,10 +19,19 @@ from fits.loop._finer import factor_with_plays
 from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._left_over import suggestions
 from fits.loop._moments import RunMean, gather, grid_of
-from fits.loop._parts_agree import check_loops, left_of
+from fits.loop._parts_agree import check_loops, left_of, predicted_um
 from fits.loop._path import branches
 from fits.loop._result import FitResult, FitStatus, RunReport
-from fits.loop._run import PAST_IS_ESTIMATED, Progress, Run, command_range_V, prepare_run, prepare_runs, simulate_run
+from fits.loop._run import (
+    PAST_IS_ESTIMATED,
+    Progress,
+    Run,
+    command_range_V,
+    prepare_aside,
+    prepare_run,
+    prepare_runs,
+    simulate_run,
+)
 from fits.loop._surface import Surface
 from fits.loop._uncertainty import Uncertainty
 from fits.loop._voltage_noise import noisy_voltages
@@ -130,8 +139,9 @@ def fit(
     figures = {"noise_um": found.noise_um, "correlation_samples": found.correlation, "substeps": 1}
     reports = [_report(found, surface, offset, run, **figures) for offset, run in zip(offsets, runs, strict=True)]
     for record in aside:
-        run = prepare_run(record, range_V, initial, holdout=1.0)
-        off = float(np.mean((run.displacement_um - simulate_run(surface, run))[run.known]))
+        run = prepare_aside(record, range_V, initial)
+        # What an estimated past adds has ended at the last sample, at the latest.
+        off = float((predicted_um(surface, run) - simulate_run(surface, run))[-1])
         reports.append(_report(found, surface, off, run))
     return FitResult(
         model=_with_offset(model, offsets[0]),
@@ -215,9 +225,7 @@ def _report(found: Estimate, surface: Surface, offset_um: float, run: Run, **fig
 
         samples = run.voltage_V[:count], run.displacement_um[:count]
         start = estimate_start(_with_offset(found.model, offset_um), *samples, found.noise_um)
-    predicted = (
-        run.displacement_um - left_of(surface, run) if run.has_past else offset_um + simulate_run(surface, run)
-    )
+    predicted = predicted_um(surface, run) if run.has_past else offset_um + simulate_run(surface, run)
     return RunReport.of(run, predicted, offset_um, start, **figures)
 
 

@@ -81,8 +81,17 @@ class SeparateFits:
 
 
 def left_of(model: Surface, run: Run) -> np.ndarray:
-    """Measurement less prediction, the offset taken off over the fitted samples, in um, shape `(n,)`."""
-    return run.without_nuisance(run.displacement_um - simulate_run(model, run), run.fitted)
+    """Measurement less prediction, in um, shape `(n,)`; offset and past are fitted to the same samples as the rest.
+
+    In a run that was only predicted they are fitted to all known samples.
+    """
+    among = run.fitted if run.fitted.any() else run.known
+    return run.without_nuisance(run.displacement_um - simulate_run(model, run), among)
+
+
+def predicted_um(model: Surface, run: Run) -> np.ndarray:
+    """What a surface predicts beside the offset and the past of a run, in um, shape `(n,)`."""
+    return run.displacement_um - left_of(model, run)
 
 
 def disagreements(

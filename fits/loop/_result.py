@@ -82,7 +82,7 @@ class RunReport:
     holds none. What was `reached` are the ranges of voltage, slew and displacement in the record. `noise_um` is the
     standard deviation of the residual (of all runs, for a hysteresis alone), `correlation_samples` the number of its
     samples that are worth one independent one, and `substeps` the steps into which each interval was divided; None of
-    a run that was only predicted.
+    a run that was only predicted. Where `has_past`, what an unknown past adds was estimated beside the rest.
     """
 
     source: str
@@ -97,6 +97,7 @@ class RunReport:
     noise_um: float | None = None
     correlation_samples: float | None = None
     substeps: int | None = None
+    has_past: bool = False
 
     @classmethod
     def of(
@@ -121,6 +122,7 @@ class RunReport:
             loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
             loop_model_pct=loop_width_pct(voltage, predicted_um[run.known]),
             reached=measured_ranges(run.record),
+            has_past=run.has_past,
             **figures,
         )
 

@@ -34,13 +34,12 @@ _ALMOST = 1e-2
 _AT_END = 0.01
 # A past is estimated that more than this part of a record's samples depends on, in a fit of loops alone, and in one
 # of a stage, whose poles are read off much smaller errors than that of the estimate.
-_SOME, MOST = 0.05, 0.5
+SOME, MOST = 0.05, 0.5
 # Said of runs whose past is.
 PAST_IS_ESTIMATED = "{}: what the rig went through before is unknown and estimated beside the rest"
 # Steps between samples that show derivatives well enough.
 _FEW_STEPS = 4
-# Told what is being done, a sentence at a time.
-Progress = Callable[[str], None]
+Progress = Callable[[str], None]  # told what is being done, a sentence at a time
 
 
 class Samples(eqx.Module):
@@ -138,8 +137,14 @@ class Run:
     @cached_property
     def of_past(self) -> int:
         """Samples up to the last whose output depends on an unknown past, be that estimated or not."""
-        known = known_samples(self.voltage_V, self.lower_V, self.upper_V) if self.has_past else self.known
+        known = self.been_at_both if self.has_past else self.known
         return 0 if known.all() else int(np.flatnonzero(~known)[-1]) + 1
+
+    @cached_property
+    def been_at_both(self) -> np.ndarray:
+        """Samples after the voltage has been at both of its own extremes."""
+        far_V = self.upper_V - self.lower_V
+        return known_samples(self.voltage_V, self.lower_V - far_V, self.upper_V + far_V)
 
     @cached_property
     def coarser(self) -> "Run":
@@ -226,8 +231,8 @@ def prepare_run(
     fitted = known.copy()
     if holdout > 0:
         first = n - round(holdout * n)
-        if has_past and (reached := _as_far_as_it_goes(record.voltage_V)) > first:
-            # What is left of its past is told by what comes after.
+        if has_past and holdout < 1 and (reached := _as_far_as_it_goes(record.voltage_V)) > first:
+            # Its past is learnt on the way there.
             first = (reached + n) // 2
         fitted[first:] = False
     if holdout < 1 and fitted.sum() < _FEWEST:
@@ -244,11 +249,21 @@ def prepare_run(
 
 def prepare_runs(records: Sequence[Record], range_V: tuple[float, float], initial: str, holdout: float) -> list[Run]:
     """Make the records of a hysteresis alone ready, errors of `prepare_run`; see `pasts_to_estimate`."""
-    pasts = (False,) * len(records)
-    if initial == "unknown":
-        pasts = pasts_to_estimate(records, range_V, holdout, _SOME)
+    unknown = initial == "unknown"
+    pasts = pasts_to_estimate(records, range_V, holdout, SOME) if unknown else (False,) * len(records)
     pairs = zip(records, pasts, strict=True)
     return [prepare_run(one, range_V, initial, holdout, estimated=past) for one, past in pairs]
+
+
+def prepare_aside(
+    record: Record, range_V: tuple[float, float], initial: Initial, least: float | None = 0.0, **settings: Any
+) -> Run:
+    """Make a record ready that is predicted as a whole; for stride, gain and hold see `prepare_run`.
+
+    An unknown past is estimated as `pasts_to_estimate` says, by default wherever samples depend on it.
+    """
+    past = initial == "unknown" and pasts_to_estimate([record], range_V, 0.0, least)[0]
+    return prepare_run(record, range_V, initial, 1.0, estimated=past, **settings)
 
 
 def pasts_to_estimate(
@@ -276,10 +291,7 @@ def _moves_inside_V(voltage_V: np.ndarray, holdout: float) -> np.ndarray:
 
 
 def _as_far_as_it_goes(voltage_V: np.ndarray) -> int:
-    """Samples until a run has gone as far both ways from where it began as it will, but for a little of the way.
-
-    What relays that it sweeps for the first time went through before is learnt there, and predicted by nothing.
-    """
+    """Samples until a run has gone, but for a little of the way, as far both ways from where it began as it will."""
     gone_V = voltage_V - voltage_V[0]
     there = np.maximum.accumulate(gone_V) >= (1 - _ALMOST) * gone_V.max()
     there &= np.minimum.accumulate(gone_V) <= (1 - _ALMOST) * gone_V.min()
@@ -293,7 +305,7 @@ def command_range_V(records: Sequence[Record]) -> tuple[float, float]:
 
 
 def initial_state(initial: Initial, lower_V: float, upper_V: float) -> m.Staircase:
-    """Make the memory before a record from its name, or its extremes; see `extremes_V`."""
+    """Make the memory before a record from its name, or its extremes."""
     return staircase(extremes_V(initial, lower_V, upper_V), _EXTREMES)
 
 

@@ -14,21 +14,21 @@ from matplotlib.ticker import LogFormatter
 from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
-from fits.loop._parts_agree import left_of
+from fits.loop._parts_agree import predicted_um as surface_um
 from fits.loop._result import FitResult, RunReport
 from fits.loop._run import (
-    MOST,
     Run,
     command_range_V,
-    pasts_to_estimate,
+    prepare_aside,
     prepare_run,
     prepare_runs,
     simulate_run,
 )
 from fits.loop._surface import Surface, continued
 from fits.plots import _style as style
+from fits.stage._began import prepare_asides
 from fits.stage._checks import speed_Hz
-from fits.stage._run import free_grid, gain_ahead, residual_of
+from fits.stage._run import gain_ahead, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from fits.stage._steps import hysteresis_alone
 from fits.stats._metrics import TWO_SIDED_95
@@ -140,7 +140,7 @@ def plot_fit(
     fraction, aside = told_apart(holdout, len(records), len(result.runs))
     range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
     runs = prepare_runs(records, range_V, initial, fraction)
-    runs += [prepare_run(record, range_V, initial, holdout=1.0) for record in aside]
+    runs += [prepare_aside(record, range_V, initial) for record in aside]
     law = result.model
     grid, columns_um = Grid(law.density.lower_V, law.density.upper_V, law.density.levels), np.asarray(columns_of(law))
     surface = grid.surface(columns_um)
@@ -158,10 +158,7 @@ def plot_fit(
 
 
 def _simulated(result: FitResult[Preisach], surface: Surface, run: Run, report: RunReport) -> Drawn:
-    if run.has_past:
-        predicted = run.displacement_um - left_of(surface, run)
-    else:
-        predicted = report.offset_um + simulate_run(surface, run)
+    predicted = surface_um(surface, run) if run.has_past else report.offset_um + simulate_run(surface, run)
     if not run.known.all():
         # The reported errors are those of the known samples; the start was estimated from the others.
         before = report.offset_um + simulate_run(surface, replace(run, start=report.start))
@@ -239,17 +236,16 @@ def plot_stage(
     # The runs are refined already.
     stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
     range_V = command_range_V([*records, *aside])
-    pasts = (False,) * len(records)
-    if free_grid(stage) is not None and set(states) == {"unknown"}:
-        pasts = pasts_to_estimate(records, range_V, fraction, MOST)
+    # What went on before them was found.
+    each = zip(result.records or records, states, known, strict=True)
     runs = [
-        prepare_run(record, range_V, state, fraction, report.substeps or 1, gain, stage.hold, estimated=past)
-        for record, state, report, past in zip(records, states, known, pasts, strict=True)
+        prepare_run(one, range_V, state, fraction, report.substeps or 1, gain, stage.hold, estimated=report.has_past)
+        for one, state, report in each
     ]
     before_aside = initial if isinstance(initial, str) else "unknown"
-    for record in aside:
-        run = prepare_run(record, range_V, before_aside, 1.0, known[-1].substeps or 1, gain, stage.hold)
-        runs.append(replace(run, fitted=run.known))
+    stride = max(report.substeps or 1 for report in known)
+    held = prepare_asides(stage, aside, range_V, before_aside, stride)
+    runs += [replace(run, fitted=run.known) for run in held]
     noises = [report.noise_um or 0.0 for report in known]
     noises += [max(noises)] * len(aside)
     drawn = [

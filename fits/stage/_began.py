@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +11,12 @@ from scipy.optimize import minimize_scalar
 
 import microid as m
 from fits.io._record import Record
-from fits.loop._run import Run, prepare_run
+from fits.loop._misfit import misfits
+from fits.loop._prediction import Initial
+from fits.loop._run import Run, prepare_aside, prepare_run
 from fits.stage._before import memory_before
 from fits.stage._run import (
+    gain_ahead,
     nuisance_columns,
     place_of_hysteresis,
     residual_of,
@@ -53,6 +57,48 @@ def _begun(stage: m.Stage, run: Run) -> Record:
     others = [charged, *(_anew(one, before_V=_before_V(stage, one)) for one in (run, charged))]
     best = min((run, *others), key=lambda one: _criterion(stage, one))
     return best.record if _criterion(stage, best) < _criterion(stage, run) - _LEAST else run.record
+
+
+def prepare_asides(
+    stage: m.Stage, records: Sequence[Record], range_V: tuple[float, float], initial: Initial, stride: int
+) -> list[Run]:
+    """Make records ready that a stage predicts as a whole, with what went on before them."""
+    if not records:
+        return []
+    ready = partial(prepare_aside, range_V=range_V, initial=initial, stride=stride, hold=stage.hold)
+    ready = partial(ready, gain=gain_ahead(stage))
+    runs = [replace(run, fitted=run.known) for run in map(ready, records)]
+    least = [None if doubt else 0.0 for doubt in doubted(runs, [residual_of(stage, run) for run in runs])]
+    runs = [ready(record, least=each) for record, each in zip(records, least, strict=True)]
+    begun = as_begun(stage, [replace(run, fitted=run.known) for run in runs])
+    return [ready(record, least=each) for record, each in zip(begun, least, strict=True)]
+
+
+def doubted(runs: Sequence[Run], left_um: Sequence[np.ndarray]) -> list[bool]:
+    """Of which runs that begin at an end of the range more is left than noise, or more until they were at both ends.
+
+    Relays beyond the range, which have never switched or never switch back, are in any state there.
+    """
+    found = []
+    for run, left, misfit in zip(runs, left_um, misfits(runs, left_um), strict=True):
+        square, fitted = left**2, np.arange(len(left)) <= np.flatnonzero(run.fitted)[-1]
+        early, later = fitted & ~run.been_at_both, fitted & run.been_at_both
+        seen = not run.has_past and early.any() and later.any()
+        found.append(bool(seen and (misfit.far or np.mean(square[early]) > _MORE * np.mean(square[later]))))
+    return found
+
+
+def weights_beside_pasts(runs: Sequence[Run], left_um: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """How much samples count where a past is estimated: less where it leaves more than the rest, `(n,)` each."""
+    weights = []
+    for run, left in zip(runs, left_um, strict=True):
+        later = _later(run)
+        early, weight = run.fitted & ~later, np.ones(len(left))
+        if run.has_past and early.any():
+            share = float(np.mean(left[later] ** 2) / max(np.mean(left[early] ** 2), 1e-300))
+            weight[~later] = share if share * _MORE < 1 else 1.0
+        weights.append(weight)
+    return weights
 
 
 def _later(run: Run) -> np.ndarray:

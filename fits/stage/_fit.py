@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 import microid as m
@@ -14,47 +13,24 @@ from fits.io._errors import DataError
 from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
 from fits.io._threads import one_thread
-from fits.loop._choose_grid import LADDER
-from fits.loop._fit import check_fit, correlated
+from fits.loop._fit import correlated
 from fits.loop._misfit import misfits, remarks_on, worst
-from fits.loop._result import FitError, FitResult, FitStatus, RunReport
-from fits.loop._run import MOST, PAST_IS_ESTIMATED, Progress, Run, pasts_to_estimate, prepare_run
-from fits.loop._stepped import refuse_many_steps
+from fits.loop._result import FitResult, FitStatus, RunReport
+from fits.loop._run import PAST_IS_ESTIMATED, Progress, Run
 from fits.stage._before import memory_before
-from fits.stage._began import as_begun
+from fits.stage._began import prepare_asides
 from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
 from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
-from fits.stage._lag_place import placed_onward
-from fits.stage._plan import Plan
 from fits.stage._run import (
-    free_grid,
-    gain_ahead,
-    place_of_hysteresis,
     residual_of,
     settled_samples,
     simulate_stage,
     yields_inside,
 )
-from fits.stage._solve import Problem, Solved
-from fits.stage._steps import present_problem, refine_problem, start_problem, starts_as_it_is
+from fits.stage._solve import Solved
+from fits.stage._solve_stage import solve_with_pasts
 from fits.stage._uncertainty import Precision, estimates
 from fits.stats._metrics import TOLD
-
-
-def default_stage(hold: m.Hold = "first") -> m.Stage:
-    """The stage of Section 3.1: driver, Preisach operator and mechanics, with all gain in the operator.
-
-    A gain anywhere else would only be seen together with it. `hold` says how the command runs between samples:
-    `first` for lines, `smooth` for curves, `zero` for steps that each begin at a sample and are not seen by it yet.
-    """
-    flat = m.Preisach(
-        m.densities.GridDensity(jnp.full(10, 0.1), jnp.asarray(0.0), jnp.asarray(1.0)),
-        m.Reversible(jnp.ones(4), jnp.asarray(0.0), jnp.asarray(1.0)),
-        jnp.asarray(0.0),
-    )
-    mechanics = m.Mechanics(jnp.asarray(100.0), jnp.asarray(0.1))
-    stage = m.Stage.of(hold=hold, driver=m.Driver(jnp.asarray(1e-3)), hysteresis=flat, mechanics=mechanics)
-    return stage.freeze("driver.gain", "mechanics.gain")
 
 
 @one_thread
@@ -101,12 +77,7 @@ def fit_stage(
         See `fit`, as for what is returned.
     """
     records, holdout = records_given(records), holdout_given(holdout)
-    found = solve_stage(records, stage, levels, holdout, initial, loss, progress)
-    begun = as_begun(found.solved.stage, found.solved.runs) if found.failure is None else []
-    if any(one.charged_V or one.before_V for one in begun):
-        progress("again with what went on before the runs")
-        records, onward = begun, found.solved.onward
-        found = solve_stage(records, stage, levels, holdout, initial, loss, progress, onward=onward)
+    found = solve_with_pasts(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs
     left, simplified = misfits(runs, solved.residuals_um), solved.problem.least_noise_share > 0
     progress("looking for delays")
@@ -129,8 +100,7 @@ def fit_stage(
     progress("comparing with the measurement")
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     before, stage = initial if isinstance(initial, str) else "unknown", solved.stage
-    settings = before, 1.0, max(run.stride for run in runs), gain_ahead(stage), stage.hold
-    held = [prepare_run(record, found.plan.range_V, *settings) for record in aside]
+    held = prepare_asides(stage, aside, found.plan.range_V, before, max(run.stride for run in runs))
     if yields_inside(stage):
         held = [replace(run, known=run.known & settled_samples(stage, run, before)) for run in held]
     summary = summarise(found.precision, held)
@@ -143,7 +113,7 @@ def fit_stage(
     if unit is not None:
         remedy = "name the right one among the columns, as in time_s=NAME[ms]"
         summary = Alternative.in_unit(summary, unit[1]).widen(summary, unit[0], remedy)
-    pasts = [run.record.source for run in runs if run.has_past]
+    pasts = [run.record.source for run in (*runs, *held) if run.has_past]
     said = [PAST_IS_ESTIMATED.format(", ".join(pasts))] if pasts else []
     summary = replace(summary, remarks=(*solved.problem.remarks, *said, *summary.remarks))
     return completed(summary, solved, (*records, *aside), loss)
@@ -155,87 +125,6 @@ def completed(found: FitResult[m.Stage], solved: Solved, records: Sequence[Recor
     notes = [warning for record in records for warning in record.warnings]
     told = tuple(dict.fromkeys((*odd, *notes, *found.remarks)))
     return replace(found, misfit=worst(misfits(solved.runs, solved.residuals_um)), remarks=told)
-
-
-@dataclass(frozen=True)
-class Solution:
-    """What the fit of a stage found, for what plan; or the best place, and the `failure` that it ended with."""
-
-    solved: Solved
-    precision: Precision
-    plan: Plan
-    failure: FitError | None = None
-
-
-def solve_stage(
-    records: Sequence[Record],
-    stage: m.Stage | None,
-    levels: int | None,
-    holdout: float | Sequence[Record],
-    initial: str | Sequence[str],
-    loss: str,
-    progress: Progress,
-    finest: int = LADDER[-1],
-    accept_best: bool = False,
-    estimated: Sequence[bool] = (),
-    onward: Problem | None = None,
-    holds: Sequence[m.Hold] = (),
-    movable: bool | None = None,
-) -> Solution:
-    """Fit a stage, on a grid of at most the finest levels; see `fit_stage`.
-
-    `accept_best` takes the best place for an answer where the fit does not become stationary. What an unknown past
-    adds is `estimated` beside the rest for some records: of those given, or of any that would lose most of its
-    samples to it. The fit goes `onward` from another one, or begins where the runs say. Commands run between samples
-    as the stage says, or each as one of `holds`. The lag is `movable` behind the hysteresis unless a stage is given.
-    """
-    fraction, _, range_V = check_fit(records, holdout, loss, levels)
-    for record in records:
-        refuse_many_steps(record, 1)
-    states = [initial] * len(records) if isinstance(initial, str) else list(initial)
-    if len(states) != len(records):
-        raise DataError(f"{len(states)} initial states were given for {len(records)} runs: give one, or one each")
-    movable = stage is None if movable is None else movable
-    stage = default_stage() if stage is None else stage
-    if not estimated and free_grid(stage) is not None and set(states) == {"unknown"}:
-        estimated = pasts_to_estimate(records, range_V, fraction, MOST)
-    ahead = stage.parts[: place_of_hysteresis(stage)]
-    if stage.hold == "zero" and not any(isinstance(part, m.Driver) for part in ahead):
-        raise DataError(
-            "the stage holds its command in steps, which is fitted only with a driver ahead of the hysteresis: "
-            "insert one, or use hold='first'"
-        )
-    plan = Plan(
-        *(tuple(records), tuple(states), fraction, range_V, loss, progress, gain_ahead(stage)),
-        tuple(holds) or (stage.hold,) * len(records),
-        accept_best=accept_best,
-        estimated=tuple(estimated),
-        movable=movable,
-    )
-    if onward is not None:
-        problem = placed_onward(plan, onward) if movable else onward
-    elif starts_as_it_is(stage):
-        if levels is not None:
-            raise DataError(f"levels is {levels}, and the stage has no hysteresis on a grid: leave it out")
-        plan, problem = present_problem(plan, stage)
-    else:
-        problem = start_problem(plan, stage, levels, finest)
-    found = _refined(plan, problem)
-    settled = plan.behind(found.solved)
-    if settled is None:
-        return found
-    progress("again without what an unknown past reaches behind the lag")
-    return _refined(settled, found.solved.onward)
-
-
-def _refined(plan: Plan, problem: Problem) -> Solution:
-    try:
-        return Solution(*refine_problem(plan, problem), plan)
-    except FitError as failure:
-        if plan.accept_best:
-            raise
-        # What the best place leaves may show why.
-        return Solution(*refine_problem(replace(plan, accept_best=True), problem), plan, failure)
 
 
 def summarise(precision: Precision, held: Sequence[Run]) -> FitResult[m.Stage]:

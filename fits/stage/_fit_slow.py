@@ -16,9 +16,10 @@ from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, prepare_run
 from fits.stage._encode import spec_of
-from fits.stage._fit import completed, default_stage, summarise
+from fits.stage._fit import completed, summarise
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, solve_chain
+from fits.stage._solve_stage import default_stage
 from fits.stage._uncertainty import Precision
 from microid import AbstractPart, Stage
 from microid.effects import EFFECTS, AbstractEffect

@@ -17,7 +17,8 @@ class Plan:
     """What was asked for, and of which records an unknown past is `estimated`; of none where that is empty.
 
     The command of each record runs between samples as `holds` say, and comes `shifts_s` later; samples that have
-    `settled`, `(n,)`, are fitted. Where its lag is `movable`, the stage may have it behind the hysteresis.
+    `settled`, `(n,)`, are fitted, and count as `weights` say, `(n,)`. Where its lag is `movable`, the stage may have
+    it behind the hysteresis.
     """
 
     records: tuple[Record, ...]
@@ -32,6 +33,7 @@ class Plan:
     estimated: tuple[bool, ...] = ()
     shifts_s: tuple[float, ...] = ()
     settled: tuple[np.ndarray, ...] = ()
+    weights: tuple[np.ndarray, ...] = ()
     movable: bool = False
 
     def runs(self, strides: Sequence[int] = ()) -> list[Run]:
@@ -55,7 +57,8 @@ class Plan:
             later = np.interp(time, record.time_s, record.voltage_V)
             record = replace(record, voltage_V=later)
         settings = self.range_V, self.states[k], self.fraction, stride, self.gain, self.holds[k]
-        return prepare_run(record, *settings, usable, bool(self.estimated) and self.estimated[k])
+        run = prepare_run(record, *settings, usable, bool(self.estimated) and self.estimated[k])
+        return replace(run, weight=self.weights[k]) if self.weights else run
 
     def behind(self, solved: Solved) -> "Plan | None":
         """The same without what an unknown past reaches behind the lag that was found; None where that is hardly any.

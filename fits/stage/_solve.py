@@ -57,7 +57,7 @@ class Weighing:
         for run, residual in zip(runs, residuals, strict=True):
             left = residual[run.fitted]
             noise.append(float(np.sqrt(np.average(left**2, weights=run.fit_weight[run.fitted]))))
-            correlation.append(correlation_samples([left]))
+            correlation.append(correlation_samples([run.weighed(residual)[run.fitted]]))
         each = float(np.exp(np.mean(np.log(correlation))))
         return cls(tuple(noise), tuple(correlation), counted or (each,) * len(noise))
 

@@ -302,9 +302,10 @@ def _visible(plan: Plan, problem: Problem) -> Problem:
     return replace(problem, z=np.asarray(problem.chain.coordinates.of(stage)))
 
 
-def refine_problem(plan: Plan, problem: Problem) -> tuple[Solved, Precision]:
-    """Fit, and fit again with the intervals divided if the finite step moves a parameter noticeably."""
-    strides, refined, problem = [1] * len(plan.records), False, _visible(plan, problem)
+def refine_problem(plan: Plan, problem: Problem, strides: Sequence[int] = ()) -> tuple[Solved, Precision]:
+    """Fit, and fit again with the intervals divided, from so many steps on, if their length moves a parameter."""
+    refined, problem = bool(strides), _visible(plan, problem)
+    strides = list(strides) or [1] * len(plan.records)
     while True:
         runs = plan.runs(strides)
         solved = solve_chain(problem, runs, plan.loss, plan.progress, accept_best=plan.accept_best)
