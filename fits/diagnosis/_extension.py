@@ -13,6 +13,7 @@ from fits.diagnosis._baseline import Baseline, simulate, with_effects
 from fits.diagnosis._effects import Bench
 from fits.diagnosis._explanation import Selection
 from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._regression import Regression, regress
 from fits.diagnosis._result import Gain
@@ -33,12 +34,16 @@ _PARTS = 12
 
 @dataclass(frozen=True)
 class Compared:
-    """Residuals of the plain and the extended stage in one run, shape `(n,)`, and which samples were held out."""
+    """Residuals of the plain and the extended stage in one run, shape `(n,)`, and which samples were held out.
+
+    The extended stage is known there to a variance of `open_um2`, shape `(n,)`.
+    """
 
     run: Run
     before_um: np.ndarray
     after_um: np.ndarray
     held_out: np.ndarray
+    open_um2: np.ndarray | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,22 @@ def extend_stage(ready: Prepared, found: Selection, model: Refit | None, own: bo
     steps = max(run.samples.stride for run in (baseline.finest if found.finest else baseline.fine))
     stage = with_effects(regression.baseline.stage, effects).with_substeps(steps)
     compared = _compare(ready, Bench(regression.baseline, model.change_um), model, regression, effects, found.finest)
+    compared = tuple(_as_open(one, k, beside, effects) for k, one in enumerate(compared))
     return Extension(stage, regression.baseline, compared, tuple(effects), own)
+
+
+def _as_open(one: Compared, k: int, projector: Projector, effects: Sequence[AbstractEffect]) -> Compared:
+    """The same with what the fitted runs leave open of the prediction of what was held out, if anything was."""
+    regression = projector.regression
+    if not one.held_out.any():
+        return one
+    if k < len(regression.rows):
+        rows, nuisance, using = regression.rows[k], regression.nuisance[k], one.run.fitted
+    else:
+        alone = regress(regression.baseline.alone(one.run), ((),), (tuple(effects),))
+        rows, nuisance, using = alone.rows[0], alone.nuisance[0], one.held_out
+    rows = rows - nuisance @ np.linalg.lstsq(nuisance[using], rows[using], rcond=None)[0]
+    return replace(one, open_um2=projector.variance_um2(rows))
 
 
 def is_own(effect: AbstractEffect) -> bool:
@@ -216,9 +236,14 @@ _without = eqx.filter_jit(project_out)
 
 
 def predicts_worse(compared: Sequence[Compared], worse_z: float, most: float) -> bool:
-    """Whether the extended stage predicts worse what was held out, if any; see `fits.stats._compare.is_worse`."""
+    """Whether the extended stage predicts worse what was held out, if any; see `fits.stats._compare.is_worse`.
+
+    By as much as is open of it, it may, unless there is doubt.
+    """
     before, after = _held_out(compared)
-    return len(before) > 0 and is_worse(before, after, worse_z, most)
+    open_um2 = sum(float(np.sum(np.where(one.held_out, one.open_um2, 0.0))) for one in compared)
+    print("OPEN", np.sqrt(np.mean(before**2)), np.sqrt(np.mean(after**2)), np.sqrt(open_um2 / max(len(after), 1)))
+    return len(before) > 0 and is_worse(before, after, worse_z, most, open_um2 if worse_z > 0 else 0.0)
 
 
 def _held_out(compared: Sequence[Compared]) -> tuple[np.ndarray, np.ndarray]:

@@ -241,6 +241,10 @@ class Projector:
         spread[self._moving] = vector[:, shown] / np.sqrt(value[shown])
         return spread
 
+    def variance_um2(self, rows: np.ndarray) -> np.ndarray:
+        """Variance, by what the runs leave open, of what the first unknowns make of rows `(n, k)`, shape `(n,)`."""
+        return np.sum((rows @ (self._spread[: rows.shape[1]] / self._scale[: rows.shape[1], None])) ** 2, axis=1)
+
     def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Steps of coordinates and columns to another baseline that the runs allow, drawn by their covariance."""
         spread = self._spread

@@ -69,10 +69,11 @@ def fit_stage(
     initial
         Memory before each run: `unknown`, `negative`, `positive` or `demagnetised`. One for all holds for records
         that are held out, too; theirs is unknown where each fitted run has its own. What an unknown one adds is
-        estimated beside the rest in a run that would lose most of its samples to it, where samples hold loops within
-        what has been reached, and left out elsewhere. With a hysteresis inside the mechanics all but `unknown` mean
-        at rest; after an unknown past, such as a steady state, the samples are left out that depend on where the
-        stage was at rest before.
+        estimated beside the rest where it counts in more than a twentieth of a run's samples, or more is left of a
+        run that begins at an end of the range, and samples hold loops within what has been reached; it is left out
+        elsewhere. What is left beside an estimated past in spite of that counts for less. With a hysteresis inside
+        the mechanics all but `unknown` mean at rest; after an unknown past, such as a steady state, the samples are
+        left out that depend on where the stage was at rest before.
     holdout, loss, progress
         See `fit`, as for what is returned.
     """

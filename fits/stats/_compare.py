@@ -8,19 +8,23 @@ from fits.stats._noise import Noise
 _BLOCKS = 24
 
 
-def improvement_z(before: np.ndarray, after: np.ndarray) -> float:
-    """Standard deviations by which errors of shape `(n,)` became smaller; 0 where there are none."""
+def improvement_z(before: np.ndarray, after: np.ndarray, allowed: float = 0.0) -> float:
+    """Standard deviations by which errors of shape `(n,)` became smaller; 0 where there are none.
+
+    By as much as is `allowed` their sum of squares may grow.
+    """
     blocks = np.array([np.sum(block) for block in np.array_split(before**2 - after**2, _BLOCKS)])
-    return float(np.sum(blocks) / max(float(np.linalg.norm(blocks - np.mean(blocks))), 1e-300))
+    return float((np.sum(blocks) + allowed) / max(float(np.linalg.norm(blocks - np.mean(blocks))), 1e-300))
 
 
-def is_worse(before: np.ndarray, after: np.ndarray, worse_z: float, most: float) -> bool:
+def is_worse(before: np.ndarray, after: np.ndarray, worse_z: float, most: float, allowed: float = 0.0) -> bool:
     """Whether errors, shape `(n,)`, grew by so many standard deviations, or their mean square by more than a part.
 
-    Where a few slow errors make them up, much worse is no more than chance by the first.
+    Where a few slow errors make them up, much worse is no more than chance by the first. By as much as is `allowed`
+    their sum of squares may grow.
     """
-    grown = float(np.sum(after**2) - np.sum(before**2))
-    return improvement_z(before, after) < -worse_z or grown > most * float(np.sum(before**2))
+    grown = float(np.sum(after**2) - np.sum(before**2)) - allowed
+    return improvement_z(before, after, allowed) < -worse_z or grown > most * float(np.sum(before**2))
 
 
 def sd_of_difference(before: np.ndarray, after: np.ndarray) -> float:
