@@ -22,7 +22,7 @@ from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._motion import at_samples, prepare, signals
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, prior_precision
-from fits.stage._solve_stage import default_stage, solve_stage
+from fits.stage._solve_stage import Solution, default_stage, solve_stage
 from fits.stats._noise import rough_noise_um
 from microid import Driver, Hold, Mechanics, Preisach, Stage
 from microid.effects import AbstractEffect, extend, host
@@ -194,9 +194,12 @@ def _fitted(
         near = onward.held(hold) if onward is not None and usable else None
         stage = default_stage(hold) if near is None else near.stage
         settings = records, stage, None, holdout, initial, "squares", progress, _FINEST
+        solve = partial(solve_stage, *settings, accept_best=True, holds=holds)
         # A lag may have been looked for behind another command.
         movable = near is None or (onward is not None and onward.stage.hold != hold)
-        found = solve_stage(*settings, accept_best=True, estimated=past, onward=near, holds=holds, movable=movable)
+        if near is None and any(past):
+            near = _without_pasts(solve)
+        found = solve(estimated=past, onward=near, movable=movable)
     except (DataError, FitError) as error:
         # That is what is done.
         why = str(error).removesuffix(BESIDE_A_LAG).removesuffix(f", {OR_ALONE}")
@@ -228,6 +231,14 @@ def _fitted(
         problem=solved.onward,
         hyper=solved.hyper,
     )
+
+
+def _without_pasts(solve: Callable[..., Solution]) -> Problem | None:
+    """Fit what depends on no unknown past, where that is most, to go on from; None where that fails."""
+    try:
+        return solve(movable=False).solved.onward
+    except (DataError, FitError):
+        return None
 
 
 def with_paths(records: Sequence[Record], aside: Sequence[Record]) -> tuple[Sequence[Record], Sequence[Record]]:

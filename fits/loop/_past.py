@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 _DEGREE, _PIECES = 3, 5
 # Kinks of either function, the highest power of what begins at each, and the part of the way that is left there.
 _KINKS, _POWER, _LEFT = 4, 2, 0.02
+# Times that the distance of a level from where a run begins is halved.
+_CLOSER = 4
 
 
 @jax.jit
@@ -31,8 +33,11 @@ def rough_past_columns(
 ) -> Float[np.ndarray, "n k"]:
     """Pieces, between levels, of the way that a hysteresis goes for the first time: ramps in V, shape `(n, k)`.
 
-    A hysteresis of few plays has kinks there that no spline follows.
+    A hysteresis of few plays has kinks there that no spline follows, and so has one that turned close around where
+    the run begins: there the levels lie ever closer.
     """
+    close_V = np.diff(levels_V).max() * np.outer([-1, 1], 0.5 ** np.arange(1, _CLOSER + 1)).ravel()
+    levels_V = np.unique(np.clip(np.append(levels_V, voltage_V[0] + close_V), levels_V[0], levels_V[-1]))
     reached_V = np.maximum.accumulate(voltage_V), np.minimum.accumulate(voltage_V)
     ramps = np.concatenate([np.clip(one[:, None], levels_V[:-1], levels_V[1:]) for one in reached_V], axis=1)
     return (ramps - ramps[0])[:, ramps[-1] != ramps[0]]

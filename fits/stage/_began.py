@@ -33,6 +33,8 @@ _DEPENDENT = 1e-10
 # Mean square that is left where the past counts, over that later, from which on it is looked into, and the part of a
 # run that is later at least.
 _MORE, _LATER = 1.1, 0.1
+# The logarithm of how few first samples are asked for by themselves, and standard deviations beyond chance.
+_FEW, _CHANCE_Z = 3, 6.0
 
 
 def as_begun(stage: m.Stage, runs: Sequence[Run]) -> list[Record]:
@@ -49,9 +51,7 @@ def as_begun(stage: m.Stage, runs: Sequence[Run]) -> list[Record]:
 
 
 def _begun(stage: m.Stage, run: Run) -> Record:
-    left_um, later = residual_of(stage, run), _later(run)
-    early = run.fitted & ~later
-    if not early.any() or np.mean(left_um[early] ** 2) < _MORE * np.mean(left_um[later] ** 2):
+    if not _leaves_more(residual_of(stage, run), run):
         return run.record
     charged = _anew(run, charged_V=_charge_V(stage, run))
     others = [charged, *(_anew(one, before_V=_before_V(stage, one)) for one in (run, charged))]
@@ -89,16 +89,34 @@ def doubted(runs: Sequence[Run], left_um: Sequence[np.ndarray]) -> list[bool]:
 
 
 def weights_beside_pasts(runs: Sequence[Run], left_um: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """How much samples count where a past is estimated: less where it leaves more than the rest, `(n,)` each."""
+    """How much samples count where a past is estimated: less where it leaves more than the rest, `(n,)` each.
+
+    Twice as many at a time: what a rig turned at last lies ever closer around where a run begins.
+    """
     weights = []
     for run, left in zip(runs, left_um, strict=True):
-        later = _later(run)
-        early, weight = run.fitted & ~later, np.ones(len(left))
-        if run.has_past and early.any():
-            share = float(np.mean(left[later] ** 2) / max(np.mean(left[early] ** 2), 1e-300))
-            weight[~later] = share if share * _MORE < 1 else 1.0
+        later, weight = _later(run), np.ones(len(left))
+        early = np.flatnonzero(run.fitted & ~later)
+        for some in np.split(early, 2 ** np.arange(_FEW, len(early).bit_length())):
+            if run.has_past and len(some):
+                times = float(np.mean(left[some] ** 2) / np.mean(left[later] ** 2))
+                weight[some] = 1 / times if _exceeds(times, len(some)) else 1.0
         weights.append(weight)
     return weights
+
+
+def _exceeds(times: float, count: int) -> bool:
+    """Whether so many samples have so many times the usual mean square, beyond chance."""
+    return times > max(_MORE, 1 + _CHANCE_Z * (2 / count) ** 0.5)
+
+
+def _leaves_more(left_um: np.ndarray, run: Run) -> bool:
+    """Whether more is left where the past counts than later, or of the first few samples, beyond chance."""
+    later = _later(run)
+    square, usual = left_um[run.fitted & ~later] ** 2, float(np.mean(left_um[later] ** 2))
+    counts = np.unique(np.append(2 ** np.arange(_FEW, max(len(square), 1).bit_length()), len(square)))
+    each = [(float(np.mean(square[:count])) / usual, count) for count in counts if count]
+    return any(_exceeds(*one) for one in each)
 
 
 def _later(run: Run) -> np.ndarray:

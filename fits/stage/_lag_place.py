@@ -3,9 +3,11 @@
 import math
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 
 from fits.loop._misfit import Misfit, misfits
+from fits.stage._encode import spec_of
 from fits.stage._plan import Plan
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem, Solved, try_chain
@@ -64,7 +66,10 @@ def _behind(plan: Plan, solved: Solved) -> Solved | None:
     if alone is None or alone.cost > solved.cost - math.log(_CLEAR) * samples:
         return None
     found: Lag = alone.stage["lag"]  # type: ignore[assignment]
-    little = replace(driver, time_constant_s=_LITTLE * found.time_constant_s)
+    spec = spec_of(driver.__dataclass_fields__["time_constant_s"])
+    least_s = 0.0 if spec is None else spec.lower
+    # Beyond the least that it may be, which no derivative leads back from.
+    little = replace(driver, time_constant_s=jnp.maximum(_LITTLE * found.time_constant_s, 2 * least_s))
     beside = _solve(plan, alone, both.swap(name, little).swap("lag", found))
     if beside is not None and beside.cost < alone.cost - math.log(_ALIKE) * samples:
         ahead: Driver = beside.stage[name]  # type: ignore[assignment]
