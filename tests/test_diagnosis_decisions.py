@@ -79,6 +79,20 @@ def test_an_extension_is_worse_only_beyond_chance(rng):
     assert predicts_worse(compared(before, slow), 2.0, 0.06)
 
 
+def test_an_extension_may_be_worse_by_what_is_open_of_its_prediction(rng):
+    """The density is less known beside a cause: five runs of it, each off by another draw of that."""
+    everywhere = np.ones(5000, dtype=bool)
+    for _ in range(5):
+        before, open_um = rng.standard_normal(5000), 0.5 * np.repeat(rng.standard_normal(500), 10)
+        known, unknown = ([Compared(None, before, before + open_um, everywhere, open_um2)] for open_um2 in (0.0, 0.3))
+        assert predicts_worse(known, 2.0, 0.06)
+        assert not predicts_worse(unknown, 2.0, 0.06)
+        # Where there is doubt what was held out must be predicted better, and far more may be no excuse.
+        assert predicts_worse(unknown, -1.0, 0.06)
+        assert predicts_worse([Compared(None, before, 2 * before, everywhere, 0.9)], 2.0, 0.06)
+        assert predicts_worse([Compared(None, before, before + open_um, everywhere, 4.0)], 2.0, 0.06)
+
+
 def test_what_the_runs_held_out_do_not_share_is_left_out_of_the_stage(rng):
     before, after = rng.standard_normal((2, 200))
     own, aside = compared(before, after)[0], compared(before, 2 * before)[0]

@@ -78,6 +78,10 @@ def test_the_projection_is_generalised_least_squares(rng):
     np.testing.assert_allclose(found @ found, target @ precision @ target, rtol=1e-9)
     np.testing.assert_allclose(projector.off(found), found, atol=1e-10)
     assert abs(found @ other) <= np.linalg.norm(found) * np.linalg.norm(other)
+    # What is open of other samples is by the covariance of all unknowns.
+    rows, covariance = rng.standard_normal((7, 15)), np.linalg.inv(design.T @ design + np.diag(prior))[:15, :15]
+    open_um2 = np.einsum("ij,jk,ik->i", rows, covariance, rows)
+    np.testing.assert_allclose(projector.variance_um2(rows), open_um2, rtol=1e-7)
 
 
 def test_columns_that_are_pressed_below_zero_stay_there(rng):
