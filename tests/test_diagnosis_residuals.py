@@ -189,6 +189,18 @@ def test_nothing_is_named_where_nothing_is_wrong():
     assert not faults().repaired
 
 
+def test_outliers_that_are_the_reading_before_them_are_said_to_be_lost_samples(rng):
+    readings, bad = np.cumsum(rng.standard_normal(5000)), np.zeros(5000, dtype=bool)
+    bad[20 * rng.choice(np.arange(1, 250), 12, replace=False)] = True
+    lost = np.where(bad, np.roll(readings, 1), readings)
+    time_s, found = np.arange(5000.0), faults(spikes=(bad,))
+    (said,) = found.repeats([Record(time_s, time_s, lost)])
+    assert said.startswith("12 of 12 outliers")
+    # A sensor's own jumps are none of them, and few are no fault.
+    assert found.repeats([Record(time_s, time_s, readings + 3 * bad)]) == []
+    assert faults().repeats([Record(time_s, time_s, lost)]) == []
+
+
 def test_faults_have_the_variance_that_they_make(rng):
     bad = np.zeros(5000, dtype=bool)
     bad[rng.choice(5000, 12, replace=False)] = True

@@ -332,7 +332,7 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
     """What the user should know of the records and the fit."""
     baseline = ready.baseline
     said = [warning for record in records for warning in record.warnings]
-    said += [*baseline.remarks, *ready.faults.remarks]
+    said += [*baseline.remarks, *ready.faults.remarks, *ready.faults.repeats(records)]
     pasts = [
         run.record.source
         for run in baseline.runs

@@ -16,6 +16,10 @@ from fits.stats._noise import Noise, quantum_um, rough_noise_um
 from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
 from microid.effects import Statistic
 
+_REPEATED = (
+    "{} of {} outliers are the reading before them to the last digit, while the stage moves on: these samples were "
+    "lost, and the last reading was taken again, so look at what reads the sensor, not at the sensor"
+)
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
 # Part of a spike off what the stage would leave, if it moved, that is in what it leaves.
@@ -64,6 +68,15 @@ class Faults:
             return False
         width_Hz = self.band.frequency_Hz / self.band.quality
         return abs(self.band.frequency_Hz - resonance_Hz) < thresholds.apart_z * width_Hz
+
+    def repeats(self, records: Sequence[Record]) -> list[str]:
+        """Say it where most spikes are no more than the reading before them, sent again."""
+        each = zip(records, self.spikes, strict=False)
+        again = [bad[1:] & (np.diff(np.asarray(record.displacement_um)) == 0) for record, bad in each]
+        lost, bad = sum(int(one.sum()) for one in again), sum(int(one.sum()) for one in self.spikes)
+        if not self.repaired or 2 * lost < bad:
+            return []
+        return [_REPEATED.format(lost, bad)]
 
     def clean(self, records: Sequence[Record]) -> list[Record]:
         """Take the spikes out of records."""
