@@ -90,7 +90,8 @@ def solve_with_pasts(
     if free and all(pasts_to_estimate(records, range_V, fraction)):
         more = doubted(found.solved.runs, found.solved.residuals_um)
         pasts = tuple(map(or_, pasts, more))
-    if not any(pasts):
+    # Of what else a stage without its resonance leaves no past is to blame.
+    if not any(pasts) or (found.solved.problem.least_noise_share and not any(found.plan.estimated)):
         return found
     if found.plan.estimated != pasts:
         progress("again with all samples, and what unknown pasts add to them")
