@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,8 +66,8 @@ def prepare_asides(
     """Make records ready that a stage predicts as a whole, with what went on before them."""
     if not records:
         return []
-    ready = partial(prepare_aside, range_V=range_V, initial=initial, stride=stride, hold=stage.hold)
-    ready = partial(ready, gain=gain_ahead(stage))
+    settings: dict[str, Any] = {"stride": stride, "gain": gain_ahead(stage), "hold": stage.hold}
+    ready = partial(prepare_aside, range_V=range_V, initial=initial, **settings)
     runs = [replace(run, fitted=run.known) for run in map(ready, records)]
     least = [None if doubt else 0.0 for doubt in doubted(runs, [residual_of(stage, run) for run in runs])]
     runs = [ready(record, least=each) for record, each in zip(records, least, strict=True)]
@@ -99,10 +100,15 @@ def weights_beside_pasts(runs: Sequence[Run], left_um: Sequence[np.ndarray]) -> 
         early = np.flatnonzero(run.fitted & ~later)
         for some in np.split(early, 2 ** np.arange(_FEW, len(early).bit_length())):
             if run.has_past and len(some):
-                times = float(np.mean(left[some] ** 2) / np.mean(left[later] ** 2))
+                times = _times_usual(left, some, later)
                 weight[some] = 1 / times if _exceeds(times, len(some)) else 1.0
         weights.append(weight)
     return weights
+
+
+def _times_usual(left_um: np.ndarray, some: np.ndarray, later: np.ndarray) -> float:
+    """Mean square of what is left of some samples over that of later ones."""
+    return float(np.mean(left_um[some] ** 2) / max(np.mean(left_um[later] ** 2), 1e-300))
 
 
 def _exceeds(times: float, count: int) -> bool:
@@ -113,10 +119,9 @@ def _exceeds(times: float, count: int) -> bool:
 def _leaves_more(left_um: np.ndarray, run: Run) -> bool:
     """Whether more is left where the past counts than later, or of the first few samples, beyond chance."""
     later = _later(run)
-    square, usual = left_um[run.fitted & ~later] ** 2, float(np.mean(left_um[later] ** 2))
-    counts = np.unique(np.append(2 ** np.arange(_FEW, max(len(square), 1).bit_length()), len(square)))
-    each = [(float(np.mean(square[:count])) / usual, count) for count in counts if count]
-    return any(_exceeds(*one) for one in each)
+    early = np.flatnonzero(run.fitted & ~later)
+    firsts = (early[:count] for count in (*2 ** np.arange(_FEW, len(early).bit_length()), len(early)))
+    return any(len(some) and _exceeds(_times_usual(left_um, some, later), len(some)) for some in firsts)
 
 
 def _later(run: Run) -> np.ndarray:
