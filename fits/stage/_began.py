@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -67,7 +66,10 @@ def prepare_asides(
     if not records:
         return []
     settings: dict[str, Any] = {"stride": stride, "gain": gain_ahead(stage), "hold": stage.hold}
-    ready = partial(prepare_aside, range_V=range_V, initial=initial, **settings)
+
+    def ready(record: Record, least: float | None = 0.0) -> Run:
+        return prepare_aside(record, range_V, initial, least, **settings)
+
     runs = [replace(run, fitted=run.known) for run in map(ready, records)]
     least = [None if doubt else 0.0 for doubt in doubted(runs, [residual_of(stage, run) for run in runs])]
     runs = [ready(record, least=each) for record, each in zip(records, least, strict=True)]
