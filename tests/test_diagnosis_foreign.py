@@ -12,8 +12,8 @@ from fits import Record, diagnose
 from fits.diagnosis._regression import _without_decayed
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.loop import _grid as grid
+from fits.loop._known import known_samples
 from fits.loop._prior import Posterior
-from fits.loop._run import known_samples
 from fits.stats._held import held_gain
 from fits.stats._noise import Noise
 from fits.stats._sensor_noise import Floor, pooled

@@ -33,7 +33,7 @@ from fits.stats._noise import Noise
 
 def run_of(voltage_V, displacement_um, rate_Hz=1000.0):
     time_s = np.arange(len(voltage_V)) / rate_Hz
-    record = SimpleNamespace(voltage_V=voltage_V, time_s=time_s, displacement_um=displacement_um)
+    record = Record(time_s, voltage_V, displacement_um)
     fitted = np.ones(len(voltage_V), dtype=bool)
     return SimpleNamespace(record=record, displacement_um=displacement_um, fitted=fitted, rate_Hz=rate_Hz)
 
@@ -178,7 +178,12 @@ def test_each_irregularity_is_seen_as_what_it_is(rng, kind):
 
 
 def faults(n=5000, noise_um=0.1, **found):
-    nothing = {"spikes": (np.zeros(n, dtype=bool),), "heights_um": (np.zeros(n),), "quantum_um": 0.0}
+    nothing = {
+        "spikes": (np.zeros(n, dtype=bool),),
+        "heights_um": (np.zeros(n),),
+        "repeats_um": np.zeros(0),
+        "quantum_um": 0.0,
+    }
     nothing |= {"jitter_s": 0.0, "jitter_um": 0.0, "jitter_z": 0.0, "band": Band(0.0, 0.0, 0.0, 0.0, 0.0)}
     return Faults((Noise(noise_um, WHITE),), "", **(nothing | found))
 
@@ -187,18 +192,6 @@ def test_nothing_is_named_where_nothing_is_wrong():
     assert name_faults(faults(), False) == []
     assert name_faults(faults(quantum_um=0.1), False) == []
     assert not faults().repaired
-
-
-def test_outliers_that_are_the_reading_before_them_are_said_to_be_lost_samples(rng):
-    readings, bad = np.cumsum(rng.standard_normal(5000)), np.zeros(5000, dtype=bool)
-    bad[20 * rng.choice(np.arange(1, 250), 12, replace=False)] = True
-    lost = np.where(bad, np.roll(readings, 1), readings)
-    time_s, found = np.arange(5000.0), faults(spikes=(bad,))
-    (said,) = found.repeats([Record(time_s, time_s, lost)])
-    assert said.startswith("12 of 12 outliers")
-    # A sensor's own jumps are none of them, and few are no fault.
-    assert found.repeats([Record(time_s, time_s, readings + 3 * bad)]) == []
-    assert faults().repeats([Record(time_s, time_s, lost)]) == []
 
 
 def test_faults_have_the_variance_that_they_make(rng):

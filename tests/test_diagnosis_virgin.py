@@ -14,8 +14,8 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import refit
 from fits.diagnosis._regression import _slope_of_change, regress
 from fits.loop._choose_grid import _resolve
+from fits.loop._known import known_samples
 from fits.loop._result import FitStatus
-from fits.loop._run import known_samples
 from fits.stats._noise import Noise
 from microid.effects.backlash import Backlash
 

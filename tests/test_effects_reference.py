@@ -337,4 +337,8 @@ def test_noise_has_the_variance_that_is_said(rng):
     np.testing.assert_allclose(said("timestamp_jitter", 1e-4), np.var(shifted), rtol=0.05)
     spikes = (rng.uniform(size=n) < 0.05) * rng.standard_normal(n) * 3
     np.testing.assert_allclose(said("outliers", 0.05, 3.0), np.var(spikes), rtol=0.15)
+    lost = rng.uniform(size=n) < 0.03
+    held = smooth[np.maximum.accumulate(np.where(lost, 0, np.arange(n)))]
+    # Lost one after another they are off by more.
+    np.testing.assert_allclose(said("repeated_readings", 0.03), np.var(held - smooth), rtol=0.2)
     assert said("floor_vibration", 0.2, 20.0, 10.0) == pytest.approx(0.04)

@@ -12,8 +12,9 @@ import fits
 import microid as m
 from fits import Record
 from fits.diagnosis._baseline import fit_baseline
+from fits.loop._known import known_samples, pasts_to_estimate
 from fits.loop._past import past_columns, rough_past_columns
-from fits.loop._run import known_samples, pasts_to_estimate, prepare_run
+from fits.loop._run import prepare_run
 from fits.stage._run import nuisance_columns
 from fits.stats._noise import stretches
 

@@ -11,7 +11,7 @@ from test_past import LEVELS, half_plane, relays
 
 import fits
 from fits import Record
-from fits.loop._run import known_samples
+from fits.loop._known import known_samples
 
 NOISE = 5e-4
 RATE_HZ = 2000.0

@@ -12,8 +12,9 @@ from _sweeps import parsed
 
 from fits import DataError, fit
 from fits.loop._design import branch_table
+from fits.loop._known import known_samples
 from fits.loop._prior import roughness
-from fits.loop._run import initial_state, known_samples
+from fits.loop._run import initial_state
 from fits.plots._sweep import _edges, _heat, _logarithmic, _parallel, _Rows, _wrapped
 from fits.sweeps._run import run_sweep
 from fits.sweeps._show import open_sweep

@@ -53,8 +53,8 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
     (truth,) = hidden.effects
     assert truth.name == name
     changed = changes_um(hidden, plain)
-    # The last digit depends on the noise itself; ties of the sensor's own digit make up the rest.
-    tolerance = 0.1 if name == "quantisation" else 1e-3
+    # The last digit, and what is read again, depend on the noise itself; ties of the sensor's own digit do the rest.
+    tolerance = 0.1 if name in ("quantisation", "repeated_readings") else 1e-3
     assert rms(changed.values()) == pytest.approx(truth.rms_um, rel=tolerance)
     for run, change_um in changed.items():
         assert rms([change_um]) == pytest.approx(truth.runs_rms_um[run], rel=tolerance, abs=1e-5)
@@ -63,7 +63,8 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
         assert truth.parameters[entry.size] == pytest.approx(entry.limit)
         assert truth.rms_um < 3 * NOISE_UM
     else:
-        assert truth.rms_um == pytest.approx(3 * NOISE_UM, rel=0.05)
+        # Whole samples are lost.
+        assert truth.rms_um == pytest.approx(3 * NOISE_UM, rel=0.2 if name == "repeated_readings" else 0.05)
     off = without(hidden, (ds.EffectSettings(name, {}, 0.0),))
     for change_um in changes_um(off, plain).values():
         # The hysteresis is asked at other voltages where the path differs in its last bit.
@@ -71,7 +72,7 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
 
 
 def test_the_library_and_what_is_outside_of_it():
-    assert len(ds.EFFECTS) == 30
+    assert len(ds.EFFECTS) == 31
     assert not set(ds.EFFECTS) & set(ds.OUTSIDE)
     assert {"wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
 

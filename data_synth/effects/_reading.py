@@ -22,3 +22,11 @@ def outliers(reading_um: FloatArray, run: Situation, *, height_um: float, share:
     # Whole nanometres: the last digit of the reading does not give them away.
     spiky_um[places] += np.round(height_um * signs * run.rng.uniform(0.5, 1.5, count), 3)
     return np.round(spiky_um, 9) + 0.0
+
+
+@effect("reading", "share", usual=0.01, limit=0.1, between={"share": (0.0, 1.0)})
+def repeated_readings(reading_um: FloatArray, run: Situation, *, share: float) -> FloatArray:
+    """A `share` of the samples is lost, and what was read last is written down again, to the last digit."""
+    lost = run.rng.random(len(reading_um)) < share
+    lost[0] = False
+    return reading_um[np.maximum.accumulate(np.where(lost, 0, np.arange(len(reading_um))))]

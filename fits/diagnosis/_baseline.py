@@ -13,9 +13,10 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns.path import PATH, gone_V
 from fits.loop._choose_grid import choose_grid
+from fits.loop._known import pasts_to_estimate
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
-from fits.loop._run import Run, pasts_to_estimate, prepare_run
+from fits.loop._run import Run, prepare_run
 from fits.stage._began import as_begun
 from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE

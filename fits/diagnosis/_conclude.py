@@ -31,7 +31,7 @@ from fits.diagnosis._thresholds import Thresholds
 from fits.io._length import length
 from fits.io._limits import measured_ranges
 from fits.io._record import Record
-from fits.loop._run import known_samples
+from fits.loop._known import known_samples
 from fits.stats._held import held_gain
 from microid.effects import card_of
 
@@ -332,7 +332,7 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
     """What the user should know of the records and the fit."""
     baseline = ready.baseline
     said = [warning for record in records for warning in record.warnings]
-    said += [*baseline.remarks, *ready.faults.remarks, *ready.faults.repeats(records)]
+    said += [*baseline.remarks, *ready.faults.remarks]
     pasts = [
         run.record.source
         for run in baseline.runs

@@ -23,6 +23,7 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._limits import MARGIN, UNITS
 from fits.io._record import refuse_repeats
 from fits.io._threads import one_thread
+from fits.loop._lost import without_lost
 from fits.stage._solve import Problem
 from microid.effects import card_of
 
@@ -119,7 +120,7 @@ def diagnose(
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError('estimation needs float64: jax.config.update("jax_enable_x64", True)')
-    records, holdout = records_given(records), holdout_given(holdout)
+    records, holdout = without_lost(records_given(records), holdout_given(holdout))
     if not records:
         raise DataError("there is no record to diagnose")
     if not 0 < false_alarm <= 0.5:

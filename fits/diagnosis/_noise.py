@@ -16,10 +16,6 @@ from fits.stats._noise import Noise, quantum_um, rough_noise_um
 from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
 from microid.effects import Statistic
 
-_REPEATED = (
-    "{} of {} outliers are the reading before them to the last digit, while the stage moves on: these samples were "
-    "lost, and the last reading was taken again, so look at what reads the sensor, not at the sensor"
-)
 # So many spikes are no chance.
 _FEWEST_SPIKES = 3
 # Part of a spike off what the stage would leave, if it moved, that is in what it leaves.
@@ -30,7 +26,8 @@ _SEEN = 0.5
 class Faults:
     """What is wrong with samples, and what the noise of each run is, learnt from `source`, in words.
 
-    Bad samples of each run are `spikes`, and `heights_um` how far off they are, shape `(n,)`. `quantum_um` is the
+    Bad samples of each run are `spikes`, and `heights_um` how far off they are, shape `(n,)`; `repeats_um` is how far
+    those were off that were lost, shape `(lost,)`. `quantum_um` is the
     last digit of the sensor, the largest of all runs, 0 for none; `jitter_um` what the jitter of the instants of
     sampling makes in the readings; `band` the strongest narrow band of all runs.
     """
@@ -39,6 +36,7 @@ class Faults:
     source: str
     spikes: tuple[np.ndarray, ...]
     heights_um: tuple[np.ndarray, ...]
+    repeats_um: np.ndarray
     quantum_um: float
     jitter_s: float
     jitter_um: float
@@ -69,15 +67,6 @@ class Faults:
         width_Hz = self.band.frequency_Hz / self.band.quality
         return abs(self.band.frequency_Hz - resonance_Hz) < thresholds.apart_z * width_Hz
 
-    def repeats(self, records: Sequence[Record]) -> list[str]:
-        """Say it where most spikes are no more than the reading before them, sent again."""
-        each = zip(records, self.spikes, strict=False)
-        again = [bad[1:] & (np.diff(np.asarray(record.displacement_um)) == 0) for record, bad in each]
-        lost, bad = sum(int(one.sum()) for one in again), sum(int(one.sum()) for one in self.spikes)
-        if not self.repaired or 2 * lost < bad:
-            return []
-        return [_REPEATED.format(lost, bad)]
-
     def clean(self, records: Sequence[Record]) -> list[Record]:
         """Take the spikes out of records."""
         if not self.repaired:
@@ -96,8 +85,8 @@ def find_faults(
     Where effects are known, `change_um` is what they change in each run, shape `(n,)`, and is taken off before.
     """
     if change_um is not None:
-        left = tuple(r - change for r, change in zip(regression.residuals, change_um, strict=True))
-        regression = replace(regression, residuals=left)
+        rest = tuple(r - change for r, change in zip(regression.residuals, change_um, strict=True))
+        regression = replace(regression, residuals=rest)
     baseline = regression.baseline
     used = (left[mask] for left, mask in zip(regression.residuals, regression.masks, strict=True))
     guess = [white_noise(max(rough_noise_um(left), 1e-9 * baseline.stroke_um)) for left in used]
@@ -106,15 +95,17 @@ def find_faults(
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
     # Rounding is noise that a command at rest does not show.
     least = quantum / 12**0.5
-    floors, found, heights, jitters, shaken, fast, positions = [], [], [], [], [], [], []
+    floors, found, heights, repeats, jitters, shaken, fast, positions = [], [], [], [], [], [], [], []
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     # After so many e-folds a motion has settled.
     settling_s = float(8.0 / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
-    each = zip(baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True)
-    for run, rows, nuisance, residual in each:
+    fitted = zip(baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True)
+    for run, rows, nuisance, residual in fitted:
         moved = residual - rows @ np.concatenate([dw, dz])
         mask = run.fitted
         left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
+        # What was written for lost samples is no reading.
+        left, residual = _between(left, run.record.lost), _between(residual, run.record.lost)
         bad = spikes(run.record.voltage_V, left, 2 * quantum, thresholds.spike_z)
         # A stage that would have to move far leaves spikes of its own, to first order, where the readings have none.
         alone = left - _between(left, bad)
@@ -122,6 +113,7 @@ def find_faults(
         smooth = _between(left, bad)
         found.append(bad)
         heights.append(left - smooth)
+        repeats.append(_repeats_um(run.record))
         fast.append(smooth)
         positions.append(run.displacement_um - left)
     fast = _without_cycles(fast, positions, [run.fitted for run in baseline.runs], thresholds)
@@ -156,7 +148,17 @@ def find_faults(
         source += ", as if it were white"
     size = size if z > thresholds.strong_z else 0.0
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
-    return Faults(tuple(noise), source, tuple(found), tuple(heights), quantum, size, made, z, band)
+    return Faults(
+        tuple(noise), source, tuple(found), tuple(heights), np.concatenate(repeats), quantum, size, made, z, band
+    )
+
+
+def _repeats_um(record: Record) -> np.ndarray:
+    """How far off the readings of lost samples were, which were those of the last one before that was not lost."""
+    lost = np.flatnonzero(record.lost)
+    reading = np.asarray(record.displacement_um)
+    before = np.maximum.accumulate(np.where(record.lost, 0, np.arange(len(record))))[lost]
+    return reading[before] - reading[lost]
 
 
 def _one_floor(bands: list[Band], thresholds: Thresholds) -> Band:
@@ -230,6 +232,11 @@ def name_faults(
         share, z = count / samples, float(np.max(np.abs(heights)) / total**0.5)
         known = ("fraction", share, count**0.5 / samples, "1"), ("size_um", size, size / (2 * count) ** 0.5, "um")
         found.append(Fault("spikes", z, known, share * size**2))
+    if len(again_um := faults.repeats_um):
+        share, square_um2 = len(again_um) / samples, float(np.mean(again_um**2))
+        z = float(np.max(np.abs(again_um)) / total**0.5)
+        lost = "fraction", share, len(again_um) ** 0.5 / samples, "1"
+        found.append(Fault("repeats", z, (lost,), share * square_um2))
     step = faults.quantum_um
     if step**2 / 12 > thresholds.minor_share * total:
         z = (samples * step**2 / 12 / total) ** 0.5

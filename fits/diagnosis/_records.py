@@ -49,6 +49,7 @@ def _together(before: Record, record: Record) -> Record:
         extra,
         ", ".join(dict.fromkeys(one.source for one in (before, record) if one.source)),
         (*before.warnings, *record.warnings),
+        lost=np.concatenate([before.lost, record.lost]),
     )
 
 

@@ -13,7 +13,7 @@ from fits.diagnosis._programs import Limits, Path, Program, Samples, menu
 from fits.diagnosis._projector import Projector
 from fits.io._limits import Extreme, RangeMap, Ranges, allowed, beyond, compared, joined
 from fits.io._record import Record
-from fits.loop._run import known_samples
+from fits.loop._known import known_samples
 from fits.stage._motion import motion, reached_by
 from microid import Stage
 

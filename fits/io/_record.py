@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fits.io._errors import DataError
 from fits.io._printable import printable
@@ -40,7 +40,8 @@ class Record(AbstractSummary):
     name, each of shape (n,), such as ``temperature_degC``; `source` is the name of the file, without its folder, and
     `warnings` say what looked odd when it was read, one sentence each; what cannot be printed of them is kept as
     codes. By `charged_V` the driver of the rig was ahead of the first command when the record began, and
-    `before_V` are the extremes that its hysteresis remembered then, oldest first, as far as they are known. A
+    `before_V` are the extremes that its hysteresis remembered then, oldest first, as far as they are known. Samples
+    are marked in `lost`, shape (n,), whose displacement was not measured; none as long as nobody looked for them. A
     `DataError` says that the arrays are not one-dimensional or differ in length, that one of the three holds what is
     no finite number, or that times do not increase.
     """
@@ -53,11 +54,14 @@ class Record(AbstractSummary):
     warnings: tuple[str, ...] = ()
     charged_V: float = 0.0
     before_V: tuple[float, ...] = ()
+    lost: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
         extra = {name: read_only(name, values) for name, values in self.extra.items()}
         _settle(self, ("time_s", "voltage_V", "displacement_um"), extra, " as time_s")
         object.__setattr__(self, "extra", MappingProxyType(extra))
+        object.__setattr__(self, "lost", self.lost.copy() if self.lost.any() else np.zeros(len(self), dtype=bool))
+        self.lost.flags.writeable = False
 
     def __len__(self) -> int:
         return self.time_s.size
@@ -77,7 +81,8 @@ class Record(AbstractSummary):
             raise TypeError("A record is sliced forwards, as in record[100:200].")
         displacement = None if self.displacement_um is None else self.displacement_um[samples]
         extra = {name: values[samples] for name, values in self.extra.items()}
-        return Record(self.time_s[samples], self.voltage_V[samples], displacement, extra, self.source, self.warnings)
+        data = self.time_s[samples], self.voltage_V[samples], displacement, extra, self.source, self.warnings
+        return Record(*data, lost=self.lost[samples])
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A MappingProxyType cannot be pickled, and records travel to worker processes.

@@ -18,6 +18,7 @@ from fits.loop._design import Grid, columns_of
 from fits.loop._finer import factor_with_plays
 from fits.loop._grid import Estimate, grid_estimate
 from fits.loop._left_over import suggestions
+from fits.loop._lost import without_lost
 from fits.loop._moments import RunMean, gather, grid_of
 from fits.loop._parts_agree import check_loops, left_of, predicted_um
 from fits.loop._path import branches
@@ -86,8 +87,8 @@ def fit(
     progress
         Told what is being done, a sentence at a time.
     """
-    records = records_given(records)
-    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss, levels)
+    records, holdout = without_lost(records_given(records), holdout_given(holdout))
+    fraction, aside, range_V = check_fit(records, holdout, loss, levels)
     if family not in FAMILIES:
         raise DataError(f"unknown density family {family!r}: choose one of {', '.join(sorted(FAMILIES))}")
 
@@ -233,12 +234,12 @@ def _remarks(runs: list[Run]) -> list[str]:
     remarks = []
     for run in runs:
         remarks += list(run.record.warnings)
-        lost = int(np.sum(~run.known))
+        unknown = int(np.sum(~(run.known | run.record.lost)))
         if run.has_past:
             remarks.append(PAST_IS_ESTIMATED.format(run.record.source))
-        if lost:
+        if unknown:
             remarks.append(
-                f"{run.record.source}: the first {lost} samples depend on what the rig went through before; "
+                f"{run.record.source}: the first {unknown} samples depend on what the rig went through before; "
                 "they were not used for the weights, and the initial state was estimated from them"
             )
     lower, upper = min(run.lower_V for run in runs), max(run.upper_V for run in runs)

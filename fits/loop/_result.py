@@ -117,7 +117,7 @@ class RunReport:
             offset_um=offset_um,
             in_sample=compare(run.fitted),
             held_out=compare(run.held_out),
-            unknown=int(np.sum(~run.known)),
+            unknown=int(np.sum(~(run.known | run.record.lost))),
             start=start,
             loop_measured_pct=loop_width_pct(voltage, measured[run.known]),
             loop_model_pct=loop_width_pct(voltage, predicted_um[run.known]),

@@ -15,6 +15,7 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.io.columns import columns_beside
 from fits.loop._design import Grid, columns_of
+from fits.loop._known import SOME, known_samples, pasts_to_estimate
 from fits.loop._past import past_columns
 from fits.loop._path import Path
 from fits.loop._plain import extremes_V, path_of
@@ -30,11 +31,6 @@ _FEWEST = 50
 _SHORTEST = 4096
 # Part of the way to it by which peaks of smooth commands miss their highest.
 _ALMOST = 1e-2
-# A voltage has been at an end once it comes this close, as a part of the range.
-_AT_END = 0.01
-# A past is estimated that more than this part of a record's samples depends on, in a fit of loops alone, and in one
-# of a stage, whose poles are read off much smaller errors than that of the estimate.
-SOME, MOST = 0.05, 0.5
 # Said of runs whose past is.
 PAST_IS_ESTIMATED = "{}: what the rig went through before is unknown and estimated beside the rest"
 # Steps between samples that show derivatives well enough.
@@ -86,7 +82,8 @@ class Run:
     unknown past, but for a constant, and `fitted` those of them that are not held out, shape `(n,)`; `weight` is that
     of each in the sum of squares, None where all count alike. For a stage the intervals are divided into `stride`
     steps, between samples the command runs as `hold` says (see `Stage`), and the stage may have been `moving` when
-    the record began. It `has_past` where its unknown memory is estimated, so that all samples are known ones.
+    the record began. It `has_past` where its unknown memory is estimated, so that all samples are known ones. Samples
+    that the record has `lost` are neither known nor fitted.
     """
 
     record: Record
@@ -137,7 +134,7 @@ class Run:
     @cached_property
     def of_past(self) -> int:
         """Samples up to the last whose output depends on an unknown past, be that estimated or not."""
-        known = self.been_at_both if self.has_past else self.known
+        known = self.been_at_both if self.has_past else self.known | self.record.lost
         return 0 if known.all() else int(np.flatnonzero(~known)[-1]) + 1
 
     @cached_property
@@ -227,7 +224,7 @@ def prepare_run(
     has_past = estimated and unknown and gain is not None
     if has_past:
         known = np.ones(n, dtype=bool)
-    known = known if usable is None else known & usable
+    known = (known if usable is None else known & usable) & ~record.lost
     fitted = known.copy()
     if holdout > 0:
         first = n - round(holdout * n)
@@ -266,30 +263,6 @@ def prepare_aside(
     return prepare_run(record, range_V, initial, 1.0, estimated=past, **settings)
 
 
-def pasts_to_estimate(
-    records: Sequence[Record], range_V: tuple[float, float], holdout: float, least: float | None = None
-) -> tuple[bool, ...]:
-    """Of which records, all in their order, the unknown past is estimated beside the rest.
-
-    Of all, or of those that would lose more than the `least` part of their samples to it. What it adds stays as it is
-    while the voltage stays within what it has reached: there the samples that are fitted must go up and down through
-    the range, as otherwise nothing would be left beside it.
-    """
-    inside_V = np.concatenate([_moves_inside_V(record.voltage_V, holdout) for record in records])
-    up_V, down_V = float(inside_V[inside_V > 0].sum()), -float(inside_V[inside_V < 0].sum())
-    if min(up_V, down_V) < (1 - 2 * _AT_END) * (range_V[1] - range_V[0]):
-        return (False,) * len(records)
-    known = (known_samples(record.voltage_V, *range_V) for record in records)
-    return tuple(least is None or float(np.mean(~one)) > least for one in known)
-
-
-def _moves_inside_V(voltage_V: np.ndarray, holdout: float) -> np.ndarray:
-    """Steps of what is not held out of a voltage that end within what it has reached before."""
-    fitted = voltage_V[: len(voltage_V) - round(holdout * len(voltage_V))]
-    highest, lowest = np.maximum.accumulate(fitted)[:-1], np.minimum.accumulate(fitted)[:-1]
-    return np.diff(fitted)[(fitted[1:] <= highest) & (fitted[1:] >= lowest)]
-
-
 def _as_far_as_it_goes(voltage_V: np.ndarray) -> int:
     """Samples until a run has gone, but for a little of the way, as far both ways from where it began as it will."""
     gone_V = voltage_V - voltage_V[0]
@@ -314,28 +287,6 @@ def initial_of(given: Initial | m.Staircase) -> Initial:
     if isinstance(given, m.Staircase):
         return tuple(np.asarray(given.extremes_V)[: int(given.count)].tolist())
     return given
-
-
-def known_samples(voltage: np.ndarray, lower_V: float, upper_V: float, initial: Initial = "unknown") -> np.ndarray:
-    """Mark what no longer depends on a past that is `initial`, one of `INITIAL_STATES`.
-
-    At an end of the range every relay is in a known state, unless it cannot be switched back within the range. Short
-    of that, relays outside the extremes that this run itself reaches either never switch or switch on the way to
-    them; once both have been visited they are a constant, which the run's own offset takes up.
-    """
-    if initial != "unknown":
-        return np.ones(len(voltage), dtype=bool)
-    highest, lowest = np.maximum.accumulate(voltage), np.minimum.accumulate(voltage)
-    found: list[np.ndarray] = []
-    # How near to an end or an own extreme, as a fraction of the range, has met it: peaks of smooth commands miss ends
-    # by a little, and the first that does not cost most of the samples is taken.
-    for share in (1e-3, 3e-3, 1e-2):
-        near = share * (upper_V - lower_V)
-        saturated = (lowest <= lower_V + near) | (highest >= upper_V - near)
-        own = near if found else 0.0
-        both = (highest >= voltage.max() - own) & (lowest <= voltage.min() + own)
-        found.append(saturated | both)
-    return next(known for known in found if 2 * known.sum() >= found[-1].sum())
 
 
 def simulate_run(model: m.Preisach | Surface, run: Run) -> np.ndarray:

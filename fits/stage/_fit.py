@@ -14,6 +14,7 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
 from fits.io._threads import one_thread
 from fits.loop._fit import correlated
+from fits.loop._lost import without_lost
 from fits.loop._misfit import misfits, remarks_on, worst
 from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import PAST_IS_ESTIMATED, Progress, Run
@@ -77,7 +78,7 @@ def fit_stage(
     holdout, loss, progress
         See `fit`, as for what is returned.
     """
-    records, holdout = records_given(records), holdout_given(holdout)
+    records, holdout = without_lost(records_given(records), holdout_given(holdout))
     found = solve_with_pasts(records, stage, levels, holdout, initial, loss, progress)
     solved, runs = found.solved, found.solved.runs
     left, simplified = misfits(runs, solved.residuals_um), solved.problem.least_noise_share > 0

@@ -12,6 +12,7 @@ from fits.io._given import AnyRuns, holdout_given, records_given
 from fits.io._record import Record
 from fits.loop._choose_grid import choose_grid, weigh_robustly
 from fits.loop._fit import check_fit
+from fits.loop._lost import without_lost
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, prepare_run
@@ -60,8 +61,8 @@ def fit_slow(
     records, levels, holdout, initial, loss, progress
         See `fit`; a number of levels of at most 32 is chosen.
     """
-    records = records_given(records)
-    fraction, aside, range_V = check_fit(records, holdout_given(holdout), loss, levels)
+    records, holdout = without_lost(records_given(records), holdout_given(holdout))
+    fraction, aside, range_V = check_fit(records, holdout, loss, levels)
     if not 0 <= relaxations <= MOST_RELAXATIONS:
         raise DataError(f"{relaxations} relaxations were asked for: choose between 0 and {MOST_RELAXATIONS}")
     stage = _stage(records, lag, relaxations)

@@ -16,9 +16,10 @@ from fits.io._errors import DataError
 from fits.io._kept import kept
 from fits.io._record import Record
 from fits.io.columns import COLUMNS, columns_beside
+from fits.loop._known import known_samples
 from fits.loop._past import past_columns
 from fits.loop._prediction import Initial, inside
-from fits.loop._run import Run, Samples, command_range_V, known_samples, prepare_run
+from fits.loop._run import Run, Samples, command_range_V, prepare_run
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12

@@ -13,9 +13,10 @@ from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._choose_grid import LADDER
 from fits.loop._fit import check_fit
+from fits.loop._known import MOST, SOME, pasts_to_estimate
 from fits.loop._misfit import misfits
 from fits.loop._result import FitError
-from fits.loop._run import MOST, SOME, Progress, pasts_to_estimate
+from fits.loop._run import Progress
 from fits.loop._stepped import refuse_many_steps
 from fits.stage._began import as_begun, doubted, weights_beside_pasts
 from fits.stage._lag_place import placed_onward

@@ -21,7 +21,7 @@ View = Literal["voltage", "position", "velocity", "frequency", "time", "since_mo
 """What a residual is drawn against: the last is the time since the voltage last started, stopped or turned."""
 # What would tell faults of the clocks apart, in the words of a report.
 _TIME_STAMPS = "raw time stamps of both clocks, which show a lost sample or a wrong rate at once."
-Statistic = Literal["", "spikes", "rounding", "jitter", "band"]
+Statistic = Literal["", "spikes", "repeats", "rounding", "jitter", "band"]
 """What is measured of single samples and of the noise to find an effect; empty for one that moves the stage."""
 
 

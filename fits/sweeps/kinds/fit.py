@@ -17,10 +17,11 @@ from fits.io._record import Record
 from fits.io._typed import typed
 from fits.loop._design import Grid, branch_table, design
 from fits.loop._fit import fit
+from fits.loop._known import known_samples
 from fits.loop._moments import Moments
 from fits.loop._plain import INITIAL_STATES
 from fits.loop._prior import Hyper, Posterior, Roughness, effective, renew_noise, roughness
-from fits.loop._run import initial_state, known_samples
+from fits.loop._run import initial_state
 from fits.stats._metrics import errors
 from fits.stats._nonnegative import minimise_nonnegative
 from fits.sweeps._devices import by_rows, in_turn, place
