@@ -7,6 +7,7 @@ import numpy as np
 import scipy
 
 from fits.io._record import Record
+from fits.stats._noise import stretches
 
 # Where readings go by more of the smallest step than this, no step from one to the next is much likelier than
 # others.
@@ -17,7 +18,7 @@ _AROUND, _FEWEST = 17, 50
 _MOST = 0.2
 # Steps as small as the smallest, as they come out rounded, are taken to be a few at least.
 _ROUNDED, _CLOSE = 1.01, 3
-# Samples were lost where chance repeats as many readings with this probability at most.
+# Samples were lost where chance repeats readings as often with this probability at most.
 _CHANCE = 1e-3
 _LOST = (
     "{}: {} readings ({:.2g} %) are the one before them to the last digit, while the stage moves on: these samples "
@@ -34,7 +35,8 @@ def without_lost(
     """
     aside = () if isinstance(holdout, int | float) else tuple(holdout)
     found = [repeated(one) for one in (*records, *aside)]
-    count, close = sum(int(marks.sum()) for marks, _ in found), sum(few for _, few in found)
+    # Many in a row are one loss, or a sensor that sticks.
+    count, close = sum(len(stretches(marks)) for marks, _ in found), sum(few for _, few in found)
     if not count or scipy.stats.nbinom.sf(count - 1, close, 0.5) > _CHANCE:
         return tuple(records), holdout if isinstance(holdout, int | float) else aside
     mended = tuple(_mended(one, marks) for one, (marks, _) in zip((*records, *aside), found, strict=True))
