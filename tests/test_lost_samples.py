@@ -29,9 +29,9 @@ def losing(rng, record, share, burst=1):
     return fits.Record(record.time_s, record.voltage_V, record.displacement_um[kept], source="run"), lost
 
 
-@pytest.mark.parametrize("burst", [1, 6])
-def test_lost_samples_are_marked_to_the_last_one(rng, burst):
-    record, lost = losing(rng, moving(rng), 0.01, burst)
+@pytest.mark.parametrize(("burst", "share"), [(1, 0.01), (6, 0.06)])
+def test_lost_samples_are_marked_to_the_last_one(rng, burst, share):
+    record, lost = losing(rng, moving(rng), share, burst)
     (found,), _ = without_lost([record], 0.1)
     np.testing.assert_array_equal(found.lost, lost)
     (warning,) = found.warnings
