@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lsim
 
 import fits
+from fits.stage._began import prepare_asides
 
 RATE_Hz, FINE, NOISE_um, TOP_V = 2000, 16, 0.002, 80.0
 TIME_CONSTANT_s, FREQUENCY_Hz, DAMPING = 6e-4, 240.0, 0.04
@@ -56,7 +57,7 @@ def random_before():
     return lambda rng, last_V: np.append(rng.uniform(0.1, 0.9, 20) * TOP_V, last_V)
 
 
-def _is_predicted(found):
+def _is_predicted(found, aside):
     values = {one.name: one.value for one in found.parameters}
     held = found.runs[-1].held_out
     print(values, held)
@@ -65,6 +66,11 @@ def _is_predicted(found):
     # A smooth density is of finite levels, and the plays of a past have turned where no spline does.
     assert held.samples > 1000
     assert held.rms_um < 2 * NOISE_um
+    # What is not known of the past is no part of a band around a run whose past is fitted.
+    (alone,) = prepare_asides(found.model, [aside], (0.0, TOP_V), "unknown", found.runs[0].substeps)
+    sd_um = found.uncertainty.sd_um(found.model.with_substeps(1), alone)
+    print("band", np.sqrt(np.mean(sd_um**2)))
+    assert np.sqrt(np.mean(sd_um**2) + NOISE_um**2) == pytest.approx(held.rms_um, rel=0.4)
 
 
 def test_loops_are_learnt_from_samples_that_an_unknown_past_reaches(rng, random_before):
@@ -79,7 +85,7 @@ def test_loops_are_learnt_from_samples_that_an_unknown_past_reaches(rng, random_
     runs = [run(rng, command, random_before(rng, command[0]), name) for command, name in named]
     found = fits.fit_stage(runs[:2], holdout=runs[2:])
     assert [one.has_past for one in found.runs] == [True, True, True]
-    _is_predicted(found)
+    _is_predicted(found, runs[2])
 
 
 def test_at_the_low_end_of_the_voltage_plays_may_be_as_they_were_never_moved(rng):
@@ -90,4 +96,4 @@ def test_at_the_low_end_of_the_voltage_plays_may_be_as_they_were_never_moved(rng
     runs = [run(rng, one, [0.0], name) for one, name in ((first, "a.csv"), (second, "b.csv"), (third, "third.csv"))]
     found = fits.fit_stage(runs[:2], holdout=runs[2:])
     assert [one.has_past for one in found.runs] == [True, True, True]
-    _is_predicted(found)
+    _is_predicted(found, runs[2])

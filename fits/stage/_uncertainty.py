@@ -1,5 +1,7 @@
 """How sure the fit of a stage is: of its parameters, however coloured the noise, of predictions and of plants."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -45,20 +47,36 @@ class StageUncertainty(AbstractUncertainty):
     grid: Grid | None
 
     def sd_um(self, model: Preisach | Stage, run: Run) -> np.ndarray:
-        return self._predicted(_stage(model), run).displacement_sd_um
+        stage = _stage(model)
+        moved_um = self._moved(stage, run)[1]
+        # What the run's nuisance parameters take up is fitted anew under each of them.
+        run = run if run.fitted.any() else replace(run, fitted=run.known)
+        nuisance = np.asarray(nuisance_columns(stage, run.coarser.samples))[: len(run.record)]
+        return self._sd_um(moved_um - nuisance @ _factors(nuisance, run.fit_weight, moved_um))
 
     def predict_known(self, model: Preisach | Stage, record: Record, initial: Initial) -> Prediction:
-        return self._predicted(*prepare_program(_stage(model), record, initial))
+        stage, run = prepare_program(_stage(model), record, initial)
+        out_um, moved_um = self._moved(stage, run, lambda moved: self._sd_um(moved - np.asarray(self.mean_um)))
+        return Prediction(out_um, moved_um, run.record.warnings)
 
-    def _predicted(self, stage: Stage, run: Run) -> Prediction:
-        chain, mean = Chain.of(stage, self.grid), np.asarray(self.mean_um)
+    def _sd_um(self, moved_um: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.sum(moved_um**2, axis=1) + float(self.discrepancy_um) ** 2)
+
+    def _moved(
+        self, stage: Stage, run: Run, reduce: Callable[[np.ndarray], np.ndarray] = lambda moved: moved
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What a stage makes of a run, shape `(n,)`, and its changes under the perturbations, `(n, k)`, reduced."""
+        chain = Chain.of(stage, self.grid)
         directions = np.asarray(self.columns_um).T, np.asarray(self.coordinates).T
         z = chain.coordinates.of(stage)
         out, slope, _ = linearise(chain, z, None, run)
-        square = along(chain, z, None, run, directions, slope, lambda moved: np.sum((moved - mean) ** 2, axis=1))
-        return Prediction(
-            out[: len(run.record)], np.sqrt(square + float(self.discrepancy_um) ** 2), run.record.warnings
-        )
+        return out[: len(run.record)], along(chain, z, None, run, directions, slope, reduce)
+
+
+def _factors(nuisance: np.ndarray, weight: np.ndarray, moved_um: np.ndarray) -> np.ndarray:
+    """Of nuisance parameters, what they take up of changes by weighted least squares, shape `(columns, k)`."""
+    root = np.sqrt(weight)[:, None]
+    return np.linalg.lstsq(root * nuisance, root * moved_um, rcond=None)[0]
 
 
 def _stage(model: Preisach | Stage) -> Stage:
@@ -100,8 +118,7 @@ class Precision:
             slope = along(self.chain, *here, run, directions)
             # What nuisance parameters take up is not learnt from.
             nuisance = np.asarray(nuisance_columns(self.solved.stage, run.coarser.samples))[: len(slope)]
-            root = np.sqrt(run.fit_weight)[:, None]
-            slope = (slope - nuisance @ np.linalg.lstsq(root * nuisance, root * slope, rcond=None)[0]).T
+            slope = (slope - nuisance @ _factors(nuisance, run.fit_weight, slope)).T
             # The other half of the weight goes to the residual that this is multiplied by.
             out.append(slope * np.sqrt(run.fit_weight) * share / self.variance)
         return out
