@@ -86,6 +86,12 @@ def test_loops_are_learnt_from_samples_that_an_unknown_past_reaches(rng, random_
     found = fits.fit_stage(runs[:2], holdout=runs[2:])
     assert [one.has_past for one in found.runs] == [True, True, True]
     _is_predicted(found, runs[2])
+    name = "mechanics.natural_frequency_Hz"
+    profile = fits.profile_stage(found, runs[:2], name, points=3, holdout=0.0)
+    # All but quadratic, of the same samples as the fit.
+    width = profile.upper - profile.lower, found[name].upper - found[name].lower
+    print("profile", width)
+    assert width[0] == pytest.approx(width[1], rel=0.3)
 
 
 def test_at_the_low_end_of_the_voltage_plays_may_be_as_they_were_never_moved(rng):

@@ -14,13 +14,13 @@ from matplotlib.ticker import LogFormatter
 from fits.io._errors import AnyPath
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
+from fits.loop._lost import without_lost
 from fits.loop._parts_agree import predicted_um as surface_um
 from fits.loop._result import FitResult, RunReport
 from fits.loop._run import (
     Run,
     command_range_V,
     prepare_aside,
-    prepare_run,
     prepare_runs,
     simulate_run,
 )
@@ -28,7 +28,7 @@ from fits.loop._surface import Surface, continued
 from fits.plots import _style as style
 from fits.stage._began import prepare_asides
 from fits.stage._checks import speed_Hz
-from fits.stage._run import gain_ahead, residual_of
+from fits.stage._run import gain_ahead, prepare_again, residual_of
 from fits.stage._start import MeasuredResponse, measure_response
 from fits.stage._steps import hysteresis_alone
 from fits.stats._metrics import TWO_SIDED_95
@@ -55,12 +55,18 @@ class Drawn:
         return np.where(self.run.known, self.run.displacement_um - self.predicted_um, np.nan)
 
 
-def told_apart(holdout: float | Sequence[Record], records: int, runs: int) -> tuple[float, Sequence[Record]]:
-    """Tell the fraction that was held out from records; a ValueError where both are not the runs of a result."""
+def told_apart(
+    holdout: float | Sequence[Record], records: Sequence[Record], runs: int
+) -> tuple[Sequence[Record], float, Sequence[Record]]:
+    """The records that were fitted, the fraction that was held out of them, and those held out, as a fit reads them.
+
+    A ValueError where these are not the runs of a result.
+    """
     fraction, aside = (0.0, holdout) if isinstance(holdout, Sequence) else (float(holdout), ())
-    if records + len(aside) != runs:
-        raise ValueError(f"the result has {runs} runs, and {records + len(aside)} records were given")
-    return fraction, aside
+    if len(records) + len(aside) != runs:
+        raise ValueError(f"the result has {runs} runs, and {len(records) + len(aside)} records were given")
+    together, _ = without_lost([*records, *aside], 0.0)
+    return together[: len(records)], fraction, together[len(records) :]
 
 
 def loops_of(runs: Sequence[Drawn]) -> Figure:
@@ -137,7 +143,7 @@ def plot_fit(
     the result. `loops`, `density`, `everett` and `heldout` are written into an existing folder, in the form `png`
     (200 dots per inch), `svg` or `pdf`; a `DataError` says if they cannot be.
     """
-    fraction, aside = told_apart(holdout, len(records), len(result.runs))
+    records, fraction, aside = told_apart(holdout, records, len(result.runs))
     range_V = float(result.model.density.lower_V), float(result.model.density.upper_V)
     runs = prepare_runs(records, range_V, initial, fraction)
     runs += [prepare_aside(record, range_V, initial) for record in aside]
@@ -228,7 +234,7 @@ def plot_stage(
     `loop` are written into an existing folder, in the form `png` (200 dots per inch), `svg` or `pdf`; a `DataError`
     if they cannot be.
     """
-    fraction, aside = told_apart(holdout, len(records), len(result.runs))
+    records, fraction, aside = told_apart(holdout, records, len(result.runs))
     states = [initial] * len(records) if isinstance(initial, str) else list(initial)
     known = result.fitted_runs
     if len(records) != len(known):
@@ -236,12 +242,7 @@ def plot_stage(
     # The runs are refined already.
     stage, gain = result.model.with_substeps(1), gain_ahead(result.model)
     range_V = command_range_V([*records, *aside])
-    # What went on before them was found.
-    each = zip(result.records or records, states, known, strict=True)
-    runs = [
-        prepare_run(one, range_V, state, fraction, report.substeps or 1, gain, stage.hold, estimated=report.has_past)
-        for one, state, report in each
-    ]
+    runs = prepare_again(result, records, states, fraction, range_V)
     before_aside = initial if isinstance(initial, str) else "unknown"
     stride = max(report.substeps or 1 for report in known)
     held = prepare_asides(stage, aside, range_V, before_aside, stride)

@@ -1,7 +1,7 @@
 """For those who do not trust a standard deviation: draws from a posterior by NUTS, and the profile likelihood."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -13,11 +13,21 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
+from fits.loop._lost import without_lost
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
-from fits.loop._run import Progress, Run, Samples
+from fits.loop._run import Progress, Run, Samples, command_range_V
+from fits.stage._began import weights_beside_pasts
 from fits.stage._chain import offsets_out
-from fits.stage._run import free_grid, nuisance_columns, prepare_again, project_out, residual_of, respond
+from fits.stage._run import (
+    free_grid,
+    nuisance_columns,
+    prepare_again,
+    project_out,
+    range_of,
+    residual_of,
+    respond,
+)
 from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
 from microid import Coordinates, Stage, parameter_table
 
@@ -71,7 +81,7 @@ def sample_posterior(
     except ImportError:
         raise DataError('the posterior needs numpyro: pip install -c constraints.txt ".[posterior]"') from None
     stage = result.model.with_substeps(1)
-    runs = prepare_again(result.model, records, initial, holdout)
+    runs = _runs(result, records, initial, holdout)
     weighing = Weighing.of(runs, [residual_of(stage, run) for run in runs])
     precision = [
         jnp.asarray(1 / (noise**2 * correlation))
@@ -137,7 +147,7 @@ def profile_stage(
     if high >= spec.upper:
         high = spec.upper - 0.01 * (spec.upper - at.value)
     values = np.linspace(low, high, points)
-    runs = prepare_again(result.model, records, initial, holdout)
+    runs = _runs(result, records, initial, holdout)
     fitted = result.model.with_substeps(1)
     stroke_um = max(float(np.ptp(run.displacement_um)) for run in runs)
     best = _solved(fitted, runs, Hyper.start(), stroke_um)
@@ -153,6 +163,18 @@ def profile_stage(
     bound = float(scipy.stats.chi2.ppf(0.95, 1)) ** 0.5
     lower, upper = (float(np.interp(sign * bound, root, values)) for sign in (-1, 1))
     return Profile(name, at.unit, values, found, lower, upper)
+
+
+def _runs(result: FitResult[Stage], records: Sequence[Record], initial: str, holdout: float) -> list[Run]:
+    """Make the runs of a result ready, of which samples beside an unknown past count as they did in the fit."""
+    range_V = range_of(result.model)
+    if not np.isfinite(range_V[0]):
+        range_V = command_range_V(records)
+    records, _ = without_lost(records, holdout)
+    runs = prepare_again(result, records, [initial] * len(records), holdout, range_V)
+    stage = result.model.with_substeps(1)
+    weights = weights_beside_pasts(runs, [residual_of(stage, run) for run in runs])
+    return [replace(run, weight=weight) for run, weight in zip(runs, weights, strict=True)]
 
 
 def _solved(stage: Stage, runs: list[Run], hyper: Hyper | None, stroke_um: float) -> Solved:

@@ -19,7 +19,8 @@ from fits.io.columns import COLUMNS, columns_beside
 from fits.loop._known import known_samples
 from fits.loop._past import past_columns
 from fits.loop._prediction import Initial, inside
-from fits.loop._run import Run, Samples, command_range_V, prepare_run
+from fits.loop._result import FitResult
+from fits.loop._run import Run, Samples, prepare_run
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
@@ -286,13 +287,21 @@ def range_of(stage: m.Stage) -> tuple[float, float]:
     return float(law.density.lower_V) / gain, float(law.density.upper_V) / gain
 
 
-def prepare_again(stage: m.Stage, records: Sequence[Record], initial: str, holdout: float) -> list[Run]:
-    """Make the records ready on which a stage was fitted; without a Preisach operator they give the range."""
-    range_V = range_of(stage)
-    if not np.isfinite(range_V[0]):
-        range_V = command_range_V(records)
-    settings = initial, holdout, stage.substeps, gain_ahead(stage), stage.hold
-    return [prepare_run(record, range_V, *settings) for record in records]
+def prepare_again(
+    result: FitResult[m.Stage],
+    records: Sequence[Record],
+    initial: Sequence[str],
+    holdout: float,
+    range_V: tuple[float, float],
+) -> list[Run]:
+    """Make the records ready on which a stage was fitted, after what was found to have gone on before them."""
+    stage = result.model
+    each = zip(result.records or records, initial, result.fitted_runs, strict=True)
+    settings = gain_ahead(stage), stage.hold
+    return [
+        prepare_run(one, range_V, state, holdout, report.substeps or 1, *settings, estimated=report.has_past)
+        for one, state, report in each
+    ]
 
 
 def prepare_program(stage: m.Stage, record: Record, initial: Initial) -> tuple[m.Stage, Run]:
