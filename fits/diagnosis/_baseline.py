@@ -20,9 +20,10 @@ from fits.loop._run import Run, prepare_run
 from fits.stage._began import as_begun
 from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
+from fits.stage._information import prior_precision
 from fits.stage._motion import at_samples, prepare, signals
 from fits.stage._run import named_parts
-from fits.stage._solve import Problem, prior_precision
+from fits.stage._solve import Problem
 from fits.stage._solve_stage import Solution, default_stage, solve_stage
 from fits.stats._noise import rough_noise_um
 from microid import Driver, Hold, Mechanics, Preisach, Stage

@@ -16,8 +16,8 @@ from fits.diagnosis._result import FoundCause
 from fits.loop._prior import definite
 from fits.loop._result import ParameterEstimate
 from fits.stage._chain import Chain
+from fits.stage._information import scale_free
 from fits.stage._run import place_of_hysteresis
-from fits.stage._solve import scale_free
 from fits.stage._uncertainty import NO_PRECISION, StageUncertainty, estimates, fewer_columns
 from fits.stats._noise import shared_square
 from microid import Preisach, Stage

@@ -13,7 +13,7 @@ from fits.diagnosis._regression import root_of
 from fits.loop._grid import EVIDENCE_LEVELS
 from fits.loop._moments import Moments
 from fits.loop._prior import Hyper, interpolation, maximise_evidence, roughness
-from fits.stage._solve import prior_precision
+from fits.stage._information import prior_precision
 from fits.stats._noise import Noise, learn_noise
 
 # A density no rougher than this, relative to itself: beyond, it would follow effects.

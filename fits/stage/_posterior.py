@@ -19,6 +19,7 @@ from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, Samples, command_range_V
 from fits.stage._began import weights_beside_pasts
 from fits.stage._chain import offsets_out
+from fits.stage._information import prior_precision
 from fits.stage._run import (
     free_grid,
     nuisance_columns,
@@ -28,7 +29,7 @@ from fits.stage._run import (
     residual_of,
     respond,
 )
-from fits.stage._solve import Problem, Solved, Weighing, prior_precision, solve_chain
+from fits.stage._solve import Problem, Solved, Weighing, solve_chain
 from microid import Coordinates, Stage, parameter_table
 
 # Half of the width that is looked at, in standard deviations of the quadratic approximation.
@@ -150,7 +151,7 @@ def profile_stage(
     runs = _runs(result, records, initial, holdout)
     fitted = result.model.with_substeps(1)
     stroke_um = max(float(np.ptp(run.displacement_um)) for run in runs)
-    best = _solved(fitted, runs, Hyper.start(), stroke_um)
+    best = _solved(fitted, runs, stroke_um)
 
     def deviance(value: float) -> float:
         progress(f"{name} = {value:.6g} {at.unit}")
@@ -177,23 +178,24 @@ def _runs(result: FitResult[Stage], records: Sequence[Record], initial: str, hol
     return [replace(run, weight=weight) for run, weight in zip(runs, weights, strict=True)]
 
 
-def _solved(stage: Stage, runs: list[Run], hyper: Hyper | None, stroke_um: float) -> Solved:
-    """Fit what is free of a stage; a `ValueError` where nothing is."""
+def _solved(stage: Stage, runs: list[Run], stroke_um: float, like: Solved | None = None) -> Solved:
+    """Fit what is free of a stage, noise and smoothness as in another solution; a `ValueError` where nothing is."""
     fitted = free_grid(stage)
     if fitted is None:
         problem = Problem.of(stage, None, np.zeros(0), None, stroke_um)
     else:
         law = fitted[1]
         grid = Grid(law.density.lower_V, law.density.upper_V, law.density.levels)
+        hyper = Hyper.start() if like is None else like.hyper
         problem = Problem.of(stage, grid, np.asarray(columns_of(law)), hyper, stroke_um)
-    return solve_chain(problem, runs, "squares", lambda _: None)
+    return solve_chain(problem, runs, "squares", lambda _: None, like=like)
 
 
 def _deviance(best: Solved, stage: Stage) -> float:
     """Twice the loss of log posterior with the rest of a stage fitted again, noise and prior as they are at best."""
     runs, stroke_um = best.runs, best.problem.stroke_um
     try:
-        solved = _solved(stage, runs, best.hyper, stroke_um)
+        solved = _solved(stage, runs, stroke_um, best)
     except ValueError:
         # Nothing else may move.
         left, columns = [residual_of(stage, run) for run in runs], np.zeros(0)

@@ -14,10 +14,11 @@ from fits.io._threads import map_in_threads
 from fits.loop._design import Grid
 from fits.loop._grid import solve_grid
 from fits.loop._moments import Data, Moments
-from fits.loop._prior import Hyper, definite, roughness
+from fits.loop._prior import Hyper
 from fits.loop._result import FitError, FitStatus
 from fits.loop._run import Progress, Run
 from fits.stage._chain import Chain
+from fits.stage._information import marginal_information, prior_precision, scale_free
 from fits.stage._moments import RunSums, run_sums, split_moments
 from fits.stage._run import residual_of
 from fits.stats._noise import correlation_samples, huber_weight
@@ -160,7 +161,13 @@ class Solved:
 
 
 def solve_chain(
-    problem: Problem, runs: list[Run], loss: str, progress: Progress, rough: bool = False, accept_best: bool = False
+    problem: Problem,
+    runs: list[Run],
+    loss: str,
+    progress: Progress,
+    rough: bool = False,
+    accept_best: bool = False,
+    like: Solved | None = None,
 ) -> Solved:
     """Find the most probable coordinates of a stage, and the columns of its grid.
 
@@ -175,11 +182,10 @@ def solve_chain(
     chain, stroke_um = problem.chain, problem.stroke_um
     z, columns_um, hyper = problem.z, problem.columns_um, problem.hyper
     damping = _FIRST
-    counted: tuple[float, ...] = ()
     settled: Solved | None = None
     best, last = np.inf, 0
     rounds: list[tuple[tuple[float, ...], Hyper | None]] = []
-    known: Hyper | None = None
+    counted, known = ((), None) if like is None else (like.weighing.correlation, like.hyper)
     for number in range(_ROUGH if rough else _ROUNDS):
         runs, sums, weighing = _gather(problem, z, columns_um, runs, loss, counted, rough)
         progress(f"  round {number + 1}: residual {', '.join(f'{noise:.4g}' for noise in weighing.noise_um)} um")
@@ -193,7 +199,9 @@ def solve_chain(
             # Smoothness and noise take turns.
             break
         rounds.append((weighing.noise_um, hyper))
-        if number >= last + _PATIENCE:
+        if like is not None:
+            weighing = replace(weighing, noise_um=like.weighing.noise_um)
+        elif number >= last + _PATIENCE:
             # For an answer both are held at their means then, so that there is one objective, which falls.
             turns = rounds[last + 1 : last + 1 + _PATIENCE]
             noises, hypers = zip(*turns, strict=True)
@@ -263,19 +271,6 @@ def try_chain(problem: Problem, runs: list[Run], *settings: Any, **further: Any)
         return None
 
 
-def prior_precision(chain: Chain, hyper: Hyper | None, stroke_um: float) -> np.ndarray:
-    """Precision of the columns before the data, in 1/um^2, shape `(D, D)`; zero where they are given."""
-    if hyper is None:
-        return np.zeros((chain.size, chain.size))
-    return np.asarray(roughness(chain.levels).precision(hyper)) / stroke_um**2
-
-
-def scale_free(prior: np.ndarray, columns_um: np.ndarray) -> np.ndarray:
-    """Take off what a prior says of the scale of all columns together, which is for the data to say; `(D, D)`."""
-    pull = prior @ columns_um
-    return prior - np.outer(pull, pull) / max(float(columns_um @ pull), 1e-300)
-
-
 def _gather(
     problem: Problem,
     z: np.ndarray,
@@ -337,13 +332,3 @@ def _step(
     _, whole, back = split_moments(total, size, 0.0)
     whole = whole - back @ columns[:size]
     return step, columns, hyper, variance, max(float(whole @ information @ whole) / len(step), 0.0) ** 0.5
-
-
-def marginal_information(total: Moments, size: int, prior: np.ndarray | None, variance: float) -> np.ndarray:
-    """Precision of the coordinates, whatever the first `size` unknowns, the columns, may be, shape `(p, p)`."""
-    gram = np.asarray(total.gram) / variance
-    if size == 0 or prior is None:
-        return gram
-    _, root = definite(gram[:size, :size] + prior)
-    half = np.linalg.solve(root, gram[:size, size:])
-    return gram[size:, size:] - half.T @ half

@@ -20,9 +20,10 @@ from fits.loop._result import ParameterEstimate
 from fits.loop._run import Run, initial_of
 from fits.loop._uncertainty import AbstractUncertainty, Uncertainty
 from fits.stage._chain import Chain, offsets_out
+from fits.stage._information import marginal_information, prior_precision, scale_free
 from fits.stage._moments import along, linearise
 from fits.stage._run import as_stage, nuisance_columns, place_of_hysteresis, prepare_program, simulate_stage
-from fits.stage._solve import Solved, marginal_information, prior_precision, scale_free
+from fits.stage._solve import Solved
 from fits.stats._metrics import TWO_SIDED_95, WHITE
 from fits.stats._noise import correlation_samples, fast_length, shared_square
 from microid import Preisach, Stage, Staircase
