@@ -23,11 +23,13 @@ from fits.diagnosis._residual_tests import (
     explain,
     explain_together,
     irregular,
+    period_of,
     repeats_in,
     run_regressors,
 )
 from fits.diagnosis._thresholds import THRESHOLDS
 from fits.stats._band import Band
+from fits.stats._cycles import Cycles
 from fits.stats._noise import Noise
 
 
@@ -175,6 +177,13 @@ def test_each_irregularity_is_seen_as_what_it_is(rng, kind):
     if kind != "bursts":
         assert min(found, key=lambda name: found[name].p) == kind
         assert found[kind].p < 1e-6
+
+
+@pytest.mark.parametrize(("period_um", "is_one"), [(0.53, False), (1.06, False), (0.8, True), (1.6, True)])
+def test_what_rounding_repeats_is_no_period_of_the_sensor(period_um, is_one):
+    """Of two waves, one over two digits has a second one over each of them."""
+    assert period_of(Cycles(period_um, 1e3, 1e3), 0.53) == (period_um if is_one else None)
+    assert period_of(Cycles(period_um, 1e3, 1e3), 0.0) == period_um
 
 
 def faults(n=5000, noise_um=0.1, **found):

@@ -217,7 +217,9 @@ def repeats_in(projector: Projector, residual: np.ndarray, plain_um: Sequence[np
 
 def period_of(repeated: Cycles, step_um: float, thresholds: Thresholds = THRESHOLDS) -> float | None:
     """The period, in um, if it is none of chance nor of the rounding of readings to multiples of `step_um`."""
-    rounding = step_um > 0 and abs(repeated.period_um / step_um - 1) < thresholds.model_error
+    # Of two waves the second may be that of the rounding.
+    off = [abs(repeated.period_um / (waves * step_um) - 1) for waves in (1, 2) if step_um > 0]
+    rounding = min(off, default=np.inf) < thresholds.model_error
     return repeated.period_um if repeated.z > thresholds.cycles and not rounding else None
 
 
