@@ -278,6 +278,10 @@ def test_gains_that_follow_the_command(rng):
     found = through(BY_NAME["thermal_gain", "self_heating"](0.1, 2.0, 500.0), interval, ramp)
     heat = 400 / 500 * (time - 2 * (1 - np.exp(-time / 2)))
     np.testing.assert_allclose(found - ramp, 0.1 * heat * ramp, rtol=0.02, atol=0.01)
+    # Of currents it takes as much as of a lag from where it was warm.
+    found = through(BY_NAME["thermal_gain", "resistive_heating"](0.1, 2.0, 50.0, 3.0, 0.7), interval, ramp)
+    warm = 0.16 + (0.7 - 0.16) * np.exp(-time / 2)
+    np.testing.assert_allclose(found - ramp, 0.1 * warm * (ramp - 3), rtol=0.01, atol=2e-3)
     found = through(BY_NAME["thermal_gain", "exponential"](0.04, 2.0, 3.0), interval, path)
     np.testing.assert_allclose(found - path, 0.04 * np.exp(-time / 2) * (path - 3), atol=1e-9)
 

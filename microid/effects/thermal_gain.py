@@ -1,9 +1,11 @@
 """Thermal gain: the piezo's gain changes with its temperature, measured or from its own losses."""
 
+from abc import abstractmethod
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from microid._linear import Times
@@ -79,11 +81,43 @@ class ThermalGain(AbstractEffect):
         return signal.with_values(signal.values + more * (signal.values - self.zero_um), before)
 
 
-@register
-class SelfHeating(AbstractEffect):
-    r"""A gain in proportion to the temperature that the piezo's own losses bring about, from cold on.
+class AbstractSelfHeating(AbstractEffect):
+    """A gain in proportion to the temperature that the piezo's own losses bring about; see its two forms."""
 
-    .. math:: w_0 + (w - w_0) (1 + b \, \mathrm{LP}_\tau[|u \dot u|] / p_0)
+    gain: AbstractVar[Float[Array, ""]]
+    time_constant_s: AbstractVar[Float[Array, ""]]
+    zero_um: AbstractVar[Float[Array, ""]]
+    before: AbstractVar[Float[Array, ""]]
+
+    @abstractmethod
+    def losses(
+        self, time_s: Times, moved_um: Float[Array, " t"], command_V: Float[Array, " t"]
+    ) -> Float[Array, " t"]:
+        """Losses over the reference, of a displacement under a command, shape `(t,)`."""
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Scale the displacement."""
+        command = start.command.values
+        if command.shape[0] == 1:
+            return signal
+        losses = self.losses(time_s, signal.values, command)
+        # At rest there are none.
+        heat = _lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
+        heat = heat + self.before * jnp.exp(-_times_of(time_s, heat.shape[0]) / self.time_constant_s)
+        before = signal.before + self.gain * heat[0] * (signal.before - self.zero_um)
+        return signal.with_values(signal.values + self.gain * heat * (signal.values - self.zero_um), before)
+
+
+def _heating_constants(scales: Scales) -> list[float]:
+    """Time constants in steps of half a decade, from a thirtieth of the record, or what heat takes, to ten."""
+    return list(_decades(max(scales.duration_s / 30, 2 * _SOONEST_s), 10 * scales.duration_s, 2))
+
+
+@register
+class SelfHeating(AbstractSelfHeating):
+    r"""A gain in proportion to the temperature that the piezo's hysteresis brings about.
+
+    .. math:: w_0 + (w - w_0) (1 + b (\mathrm{LP}_\tau[|u \dot u|] / p_0 + h e^{-t / \tau}))
 
     Attributes
     ----------
@@ -95,6 +129,8 @@ class SelfHeating(AbstractEffect):
         `p0`, given.
     zero_um
         `w0`, the displacement that stays, given.
+    before
+        `h`: how warm it was when the record began, as losses of so many times `p0` make it in the end.
     """
 
     name: ClassVar[str] = "thermal_gain"
@@ -103,6 +139,7 @@ class SelfHeating(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain",)
+    history: ClassVar[tuple[str, ...]] = ("before",)
     fingerprint: ClassVar[str] = ThermalGain.fingerprint
     confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
     experiment: ClassVar[str] = ThermalGain.experiment
@@ -115,25 +152,68 @@ class SelfHeating(AbstractEffect):
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
     reference_V2_per_s: Float[Array, ""] = array()
     zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+    before: Float[Array, ""] = param(default=0.0, unit="1")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
         """Time constants in steps of half a decade, from a thirtieth of the record, or what heat takes, to ten."""
         losses = max(abs(scales.lower_V), abs(scales.upper_V)) * scales.fastest_V_per_s / 2
-        if not losses > 0:
-            return ()
-        grid = _decades(max(scales.duration_s / 30, 2 * _SOONEST_s), 10 * scales.duration_s, 2)
-        return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant), jnp.asarray(losses)),) for constant in grid)
+        each = _heating_constants(scales) if losses > 0 else []
+        return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant), jnp.asarray(losses)),) for constant in each)
 
-    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
-        """Scale the displacement."""
-        command = start.command.values
-        if command.shape[0] == 1:
-            return signal
-        losses = jnp.abs(command * _rate_of(time_s, command)) / self.reference_V2_per_s
-        # The part before the record was at rest, and cold.
-        heat = _lowpass(time_s, losses.at[0].set(0), self.time_constant_s)
-        return signal.with_values(signal.values + self.gain * heat * (signal.values - self.zero_um), signal.before)
+    def losses(
+        self, time_s: Times, moved_um: Float[Array, " t"], command_V: Float[Array, " t"]
+    ) -> Float[Array, " t"]:
+        """Losses of a hysteresis: so much for every way that the command goes."""
+        return jnp.abs(command_V * _rate_of(time_s, command_V)) / self.reference_V2_per_s
+
+
+@register
+class ResistiveHeating(AbstractSelfHeating):
+    r"""A gain in proportion to the temperature that currents bring about in the piezo's electrodes and leads.
+
+    .. math:: w_0 + (w - w_0) (1 + b (\mathrm{LP}_\tau[\dot w^2] / v_0^2 + h e^{-t / \tau}))
+
+    Attributes
+    ----------
+    gain, time_constant_s, zero_um, before
+        As of `SelfHeating`.
+    reference_um_per_s
+        `v0`, given.
+    """
+
+    name: ClassVar[str] = "thermal_gain"
+    form: ClassVar[str] = "resistive_heating"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain",)
+    history: ClassVar[tuple[str, ...]] = ("before",)
+    fingerprint: ClassVar[str] = ThermalGain.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
+    experiment: ClassVar[str] = ThermalGain.experiment
+    source: ClassVar[str] = "Joule's law, the current of a capacitance being in proportion to the rate of its voltage"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
+    gain: Float[Array, ""] = param(unit="1", scale=0.01)
+    time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
+    reference_um_per_s: Float[Array, ""] = array()
+    zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+    before: Float[Array, ""] = param(default=0.0, unit="1")
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Time constants in steps of half a decade, from a thirtieth of the record, or what heat takes, to ten."""
+        range_V = max(scales.upper_V - scales.lower_V, 1e-300)
+        fast = scales.fastest_V_per_s / range_V * scales.stroke_um / 2
+        each = _heating_constants(scales) if fast > 0 else []
+        return tuple((cls(jnp.asarray(0.01), jnp.asarray(constant), jnp.asarray(fast)),) for constant in each)
+
+    def losses(
+        self, time_s: Times, moved_um: Float[Array, " t"], command_V: Float[Array, " t"]
+    ) -> Float[Array, " t"]:
+        """Losses of a current: charge goes with the displacement, and follows the command behind the driver alone."""
+        return (_rate_of(time_s, moved_um) / self.reference_um_per_s) ** 2
 
 
 @register
