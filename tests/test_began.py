@@ -69,3 +69,38 @@ def left_after_turns(rng):
 
 def run_of(record, lower, upper):
     return prepare_run(record, (lower, upper), "unknown", 0.0, 1, estimated=True)
+
+
+def test_turns_are_found_through_a_resonance_that_they_set_ringing(rng):
+    """Passed on by static gains they are a guess: of eight it left less than a tenth of two.
+
+    Less than a tenth was left of 23 of 24 fresh ones: of fewer than three of five it is by chance once in 1,400 runs.
+    """
+    better = [left_through_a_resonance(rng) for _ in range(5)]
+    print(better)
+    assert np.sum(np.array(better) < 0.1) >= 3
+
+
+def left_through_a_resonance(rng):
+    """The same behind a mass that rings, under a swing not far below its resonance."""
+    model = random_model(rng, 24)
+    lower, upper = limits_V(model)
+    natural, span = 2 * np.pi * rng.uniform(120, 180), upper - lower
+    stage = m.Stage.of(driver=m.Driver(1e-7), hysteresis=model, mechanics=m.Mechanics(natural / (2 * np.pi), 0.02))
+    fine_s = np.arange((COUNT - 1) * PARTS + 1) / RATE_Hz / PARTS
+    swing = np.sin(2 * np.pi * 80 * fine_s) * (0.02 + 0.1 * fine_s / fine_s[-1])
+    command_V = lower + span * (0.3 + 0.35 * fine_s / fine_s[-1] + swing)
+    command_V = np.interp(fine_s, fine_s[::PARTS], command_V[::PARTS])
+    closing = np.sort(rng.uniform(0.05, 0.28, 3))
+    shares = np.stack([0.98 - 2 * closing, closing], axis=1).ravel()
+    path_V = np.concatenate([[lower], lower + span * shares, command_V])
+    given_um = np.array(model(jnp.asarray(path_V)))[-len(fine_s) :]
+    rung = lsim(([natural**2], [1.0, 0.04 * natural, natural**2]), given_um - given_um[0], fine_s)[1]
+    read_um = given_um[0] + rung[::PARTS]
+    read_um += NOISE * np.std(read_um) * rng.standard_normal(COUNT)
+
+    def prepared(record):
+        return prepare_run(record, (lower, upper), "unknown", 0.0, PARTS, estimated=True)
+
+    run = prepared(Record(fine_s[::PARTS], command_V[::PARTS], read_um))
+    return float(np.std(residual_of(stage, prepared(*as_begun(stage, [run])))) / np.std(residual_of(stage, run)))

@@ -17,7 +17,7 @@ from fits.loop._known import pasts_to_estimate
 from fits.loop._prior import Hyper, roughness
 from fits.loop._result import FitError
 from fits.loop._run import Run, prepare_run
-from fits.stage._began import as_begun
+from fits.stage._began import TURNS, as_begun, differ
 from fits.stage._chain import Chain
 from fits.stage._checks import BESIDE_A_LAG, OR_ALONE
 from fits.stage._information import prior_precision
@@ -160,11 +160,14 @@ def fit_baseline(
     records, aside = with_paths(records, aside)
     settings = holdout, initial, progress, holds, better
     found = _fitted(records, aside, *settings, onward, left_out)
-    begun = as_begun(found.stage, (*found.runs, *found.aside)) if found.dynamic else []
-    if not any(one.charged_V or one.before_V for one in begun):
-        return found
-    progress("again with what went on before the runs")
-    return _fitted(begun[: len(records)], begun[len(records) :], *settings, found.problem, left_out)
+    for _ in range(TURNS if found.dynamic else 0):
+        runs = *found.runs, *found.aside
+        begun = as_begun(found.stage, runs)
+        if not differ([run.record for run in runs], begun):
+            break
+        progress("again with what went on before the runs")
+        found = _fitted(begun[: len(records)], begun[len(records) :], *settings, found.problem, left_out)
+    return found
 
 
 def _fitted(

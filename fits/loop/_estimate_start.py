@@ -15,10 +15,16 @@ from microid import Preisach, Staircase
 _PAIRS = 6
 _SAMPLES = 1024
 _SIZE = 64
+# Share of the way that stands for none.
+_LEAST = 1e-3
 
 
-def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
-    """Extremes that close in on the first sample, by the shares of the way that the coordinates stand for."""
+def closing_staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Array, ""]) -> Staircase:
+    """Extremes that close in on the first voltage, by the shares of the way that coordinates stand for.
+
+    They stand for the minima and, in the second row, for the maxima: logarithms of the shares of the way from an end
+    of the range, up to a constant.
+    """
     below, above = jax.nn.softmax(z[0]), jax.nn.softmax(z[1])
     low, high = model.density.lower_V, model.density.upper_V
     minima = low + (first_V - low) * jnp.cumsum(below)[:-1]
@@ -29,11 +35,21 @@ def _staircase(z: Float[Array, "2 pairs_1"], model: Preisach, first_V: Float[Arr
     return Staircase(jnp.pad(extremes, (0, _SIZE - used), mode="edge"), jnp.asarray(used, dtype=jnp.int32))
 
 
+def closing_coordinates(start: Staircase, model: Preisach, first_V: float) -> Float[np.ndarray, "2 pairs_1"]:
+    """The coordinates of extremes that close in on the first voltage; where they do not, as near as they come."""
+    extremes = np.asarray(start.extremes_V)[1 : int(start.count) - 1]
+    rows = []
+    for end_V, inner_V in ((model.density.lower_V, extremes[1::2]), (model.density.upper_V, extremes[::2])):
+        way_V = np.abs(np.diff(np.concatenate([[float(end_V)], inner_V, [first_V]])))
+        rows.append(np.log(np.maximum(way_V / max(float(np.sum(way_V)), 1e-300), _LEAST)))
+    return np.stack([row - np.mean(row) for row in rows])
+
+
 def _residual(
     z: Float[Array, "2 pairs_1"], args: tuple[Preisach, Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
 ) -> Float[Array, " m"]:
     model, voltage_V, displacement_um, weight = args
-    start = _staircase(z, model, voltage_V[0])
+    start = closing_staircase(z, model, voltage_V[0])
     # A faint pull towards an even decay decides what the samples leave open.
     return jnp.concatenate([weight * (model(voltage_V, start) - displacement_um), 1e-2 * z.ravel()])
 
@@ -43,7 +59,7 @@ def _solve(args: tuple[Preisach, Array, Array, Array]) -> Staircase:
     solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     start = jnp.zeros((2, _PAIRS + 1))
     solution: Any = optx.least_squares(_residual, solver, start, args=args, max_steps=100, throw=False)
-    return _staircase(solution.value, args[0], args[1][0])
+    return closing_staircase(solution.value, args[0], args[1][0])
 
 
 def estimate_start(

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import qr
 from scipy.optimize import minimize_scalar
 
 import microid as m
@@ -23,16 +22,18 @@ from fits.stage._run import (
     respond,
     settled_columns,
     simulate_stage,
+    spanned,
 )
+from fits.stats._noise import rough_noise_um
 
 # Voltages that are tried over the range, the part of their distance to which the best is found, and how much larger
 # the Bayesian information criterion must be without.
 _TRIED, _FINE, _LEAST = 25, 1e-3, 10.0
-# Part of a column beside the others below which it is rounding.
-_DEPENDENT = 1e-10
 # Mean square that is left where the past counts, over that later, from which on it is looked into, and the part of a
 # run that is later at least.
 _MORE, _LATER = 1.1, 0.1
+# Times that what was before is looked for: beside it a stage is fitted again, and shows more of it.
+TURNS = 2
 # The logarithm of how few first samples are asked for by themselves, and standard deviations beyond chance.
 _FEW, _CHANCE_Z = 3, 6.0
 
@@ -50,12 +51,18 @@ def as_begun(stage: m.Stage, runs: Sequence[Run]) -> list[Record]:
     return [_begun(stage, run) if run.moving and run.has_past else run.record for run in runs]
 
 
+def differ(records: Sequence[Record], begun: Sequence[Record]) -> bool:
+    """Whether something else is known to have been before records now."""
+    each = zip(records, begun, strict=True)
+    return any((one.charged_V, one.before_V) != (other.charged_V, other.before_V) for one, other in each)
+
+
 def _begun(stage: m.Stage, run: Run) -> Record:
     if not _leaves_more(residual_of(stage, run), run):
         return run.record
     charged = _anew(run, charged_V=_charge_V(stage, run))
-    others = [charged, *(_anew(one, before_V=_before_V(stage, one)) for one in (run, charged))]
-    best = min((run, *others), key=lambda one: _criterion(stage, one))
+    others = [run, charged, *(_anew(one, before_V=_before_V(stage, one)) for one in (run, charged))]
+    best = min(others, key=lambda one: _criterion(stage, one))
     return best.record if _criterion(stage, best) < _criterion(stage, run) - _LEAST else run.record
 
 
@@ -119,8 +126,14 @@ def _exceeds(times: float, count: int) -> bool:
 
 
 def _leaves_more(left_um: np.ndarray, run: Run) -> bool:
-    """Whether more is left where the past counts than later, or of the first few samples, beyond chance."""
+    """Whether more is left where the past counts than later, or of the first few samples, beyond chance.
+
+    Where the past counts to the end, more is left than noise.
+    """
     later = _later(run)
+    if later[: run.of_past].any():
+        fitted_um = left_um[run.fitted]
+        return _exceeds(float(np.mean(fitted_um**2)) / max(rough_noise_um(fitted_um) ** 2, 1e-300), len(fitted_um))
     early = np.flatnonzero(run.fitted & ~later)
     firsts = (early[:count] for count in (*2 ** np.arange(_FEW, len(early).bit_length()), len(early)))
     return any(len(some) and _exceeds(_times_usual(left_um, some, later), len(some)) for some in firsts)
@@ -153,7 +166,11 @@ def _before_V(stage: m.Stage, run: Run) -> tuple[float, ...]:
     """Extremes that the hysteresis remembered, at it, by what is left where the past counts."""
     later, left_um, alone_um = _later(run), residual_of(stage, run), simulate_stage(stage, run)
     offset_um = float(np.mean((run.displacement_um - left_um - alone_um)[later]))
-    found = memory_before(stage, run, alone_um + offset_um, float(np.std(left_um[later])))
+    noise_um = float(np.std(left_um[later]))
+    guess = run.start if run.record.before_V else memory_before(stage, run, alone_um + offset_um, noise_um)
+    from fits.stage._turned import memory_behind  # its solver takes long to import
+
+    found = memory_behind(stage, run, guess, rough_noise_um(left_um[run.fitted]))
     return tuple(np.asarray(found.extremes_V)[: int(found.count)].tolist())
 
 
@@ -162,7 +179,7 @@ def _charge_V(stage: m.Stage, run: Run) -> float:
     samples, record = run.coarser.samples, run.record
     root = np.sqrt(np.asarray(samples.weight))
     columns = settled_columns(stage, samples), nuisance_columns(stage, samples)
-    plain, powers = (_spanned(root[:, None] * np.asarray(each)) for each in columns)
+    plain, powers = (spanned(root[:, None] * np.asarray(each)) for each in columns)
 
     def left(rest_V: float, beside: np.ndarray = plain) -> float:
         """Sum of squares that the stage leaves after a rest, in um^2."""
@@ -181,10 +198,3 @@ def _charge_V(stage: m.Stage, run: Run) -> float:
     if run.fitted.sum() * np.log(now / float(found.fun)) < _LEAST:
         return record.charged_V
     return float(found.x) - float(record.voltage_V[0])
-
-
-def _spanned(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that span the same, shape `(n, r)`."""
-    size = np.linalg.norm(columns, axis=0)
-    basis, upper, _ = qr(columns[:, size > 0] / size[size > 0], mode="economic", pivoting=True)
-    return basis[:, np.abs(np.diagonal(upper)) > _DEPENDENT]

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.linalg import qr
 
 import microid as m
 from fits.io._errors import DataError
@@ -24,6 +25,8 @@ from fits.loop._run import Run, Samples, prepare_run
 
 # Relative size of what is too small to be seen.
 _TINY = 1e-12
+# Part of a column beside the others below which it is rounding.
+_DEPENDENT = 1e-10
 # Powers of what a driver was charged with.
 _POWERS = 3
 
@@ -159,6 +162,13 @@ def _best_factors(
     weighted = weight[:, None] * scaled
     gram = scaled.T @ weighted + _TINY * jnp.eye(columns.shape[1])
     return jnp.linalg.solve(gram, weighted.T @ values) / scale
+
+
+def spanned(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span the same, shape `(n, r)`."""
+    size = np.linalg.norm(columns, axis=0)
+    basis, upper, _ = qr(columns[:, size > 0] / size[size > 0], mode="economic", pivoting=True)
+    return np.asarray(basis[:, np.abs(np.diagonal(upper)) > _DEPENDENT])
 
 
 def simulate_stage(stage: m.Stage, run: Run) -> np.ndarray:

@@ -18,7 +18,7 @@ from fits.loop._misfit import misfits
 from fits.loop._result import FitError
 from fits.loop._run import Progress
 from fits.loop._stepped import refuse_many_steps
-from fits.stage._began import as_begun, doubted, weights_beside_pasts
+from fits.stage._began import TURNS, as_begun, differ, doubted, weights_beside_pasts
 from fits.stage._lag_place import placed_onward
 from fits.stage._plan import Plan
 from fits.stage._run import free_grid, gain_ahead, place_of_hysteresis
@@ -104,8 +104,10 @@ def solve_with_pasts(
         before = {"onward": found.solved.onward, "strides": [run.stride for run in found.solved.runs]}
         return solve(records, movable=False, **before, **further)
 
-    begun = as_begun(found.solved.stage, found.solved.runs)
-    if any(one.charged_V or one.before_V for one in begun):
+    for _ in range(TURNS):
+        begun = as_begun(found.solved.stage, found.solved.runs)
+        if found.failure is not None or not differ([run.record for run in found.solved.runs], begun):
+            break
         progress("again with what went on before the runs")
         records = begun
         found = again()
