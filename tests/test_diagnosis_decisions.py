@@ -15,7 +15,7 @@ from fits.diagnosis._effects import Law
 from fits.diagnosis._explanation import Cause
 from fits.diagnosis._extension import Compared, Extension, gain_of, predicts_worse, shared_effects, without_effects
 from fits.diagnosis._misfit import Misfit
-from fits.diagnosis._prepare import Prepared, _covered
+from fits.diagnosis._prepare import Prepared, _covered, of_half_a_sample
 from fits.diagnosis._result import Gain
 from fits.stage._solve_stage import default_stage
 from fits.stats._compare import improvement_z
@@ -314,3 +314,16 @@ def test_the_class_of_a_cause_lists_none_that_is_named_beside_it(monkeypatch):
         causes, model, beside, (1.0, 1.0), (), SimpleNamespace(noise=[SimpleNamespace(total_um=1.0)])
     )
     assert {one.name: one.also_consistent for one in found} == {"sensor_lowpass": ("transport_delay",), "creep": ()}
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "hold", "is_said"), [(5.1e-4, "first", True), (8e-4, "first", False), (5.1e-4, "zero", False)]
+)
+def test_a_delay_of_half_a_sample_may_be_a_command_that_is_held(delay_s, hold, is_said):
+    late = SimpleNamespace(name="delay_s", value=delay_s, sd=1e-5)
+    cause = SimpleNamespace(name="transport_delay", parameters=(late,))
+    run = SimpleNamespace(rate_Hz=1000.0, hold=hold)
+    assert bool(of_half_a_sample([cause], [run])) == is_said
+    # What has no delay has none of half a sample.
+    other = SimpleNamespace(name="creep", parameters=(late,))
+    assert of_half_a_sample([other], [run]) == []

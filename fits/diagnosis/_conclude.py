@@ -23,7 +23,7 @@ from fits.diagnosis._extension import (
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
 from fits.diagnosis._misfit import SHOWN, worth_naming
 from fits.diagnosis._noise import Faults, find_faults, name_faults
-from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared, of_holds_aside
+from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared, of_half_a_sample, of_holds_aside
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._residual_tests import explain, further_regressors, irregular, run_regressors
 from fits.diagnosis._result import Diagnosis, FoundCause, Gain, RunView, Step, Test, Verdict
@@ -195,6 +195,7 @@ def conclude(
         rest_noise = max(rest_noise, max(excess, 0.0) ** 0.5)
     unexplained_um = rest_noise * unit_um if left_over else 0.0
     moving = [cause for cause in causes if not card_of(cause.name).statistic]
+    remarks += of_half_a_sample(causes, baseline.runs)
     compared = extension.compared
     if baseline.aside:
         # What was kept aside of the fitted runs has been looked at.

@@ -13,7 +13,7 @@ from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._plain_fit import IN_LINES, IN_STEPS, Holds, PlainFit
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression, regress
-from fits.diagnosis._result import Step
+from fits.diagnosis._result import FoundCause, Step
 from fits.diagnosis._score import Probe
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
@@ -21,7 +21,9 @@ from fits.loop._run import Run
 from fits.stage._run import named_parts
 from fits.stage._solve import Problem
 from fits.stats._held import held_gain
+from fits.stats._metrics import TWO_SIDED_95
 from microid import Driver, Hold
+from microid.effects import card_of
 
 # A delay below this part of the sampling interval is no effect, but one of each run's own.
 _SKEW = 0.04
@@ -39,6 +41,10 @@ _DRIVER = (
 _STEPS = (
     "the command{} is taken to be held between samples, as a converter does: behind lines the readings would be late "
     "by half a sample, and a delay of that length would look the same"
+)
+_LATE = (
+    "readings that are late by half a sample look the same as a command that is held between its samples: if a "
+    "converter holds it, the delay is that, and nothing is wrong"
 )
 _CURVES = (
     "the command{} is taken to run along curves through its samples, since that leaves less of the displacement than "
@@ -282,6 +288,13 @@ def _of_holds(baseline: Baseline) -> list[str]:
         of = "" if len(each) == 1 else " of " + ", ".join(r.record.source for r in baseline.runs if r.hold == hold)
         said.append(_WORDS[hold][0].format(of))
     return said
+
+
+def of_half_a_sample(causes: Sequence[FoundCause], runs: Sequence[Run]) -> list[str]:
+    """Say it where a delay is that of a command that is held, which runs are not taken to have."""
+    late = [one for cause in causes for one in cause.parameters if one.name == (card_of(cause.name).delay or None)]
+    halves_s = [0.5 / run.rate_Hz for run in runs if run.hold != "zero"]
+    return [_LATE] if any(abs(one.value - half) < TWO_SIDED_95 * one.sd for one in late for half in halves_s) else []
 
 
 def of_holds_aside(usual: Hold, runs: Sequence[Run]) -> list[str]:
