@@ -81,7 +81,7 @@ class ThermalGain(AbstractEffect):
         return signal.with_values(signal.values + more * (signal.values - self.zero_um), before)
 
 
-class AbstractSelfHeating(AbstractEffect):
+class _AbstractSelfHeating(AbstractEffect):
     """A gain in proportion to the temperature that the piezo's own losses bring about; see its two forms."""
 
     gain: AbstractVar[Float[Array, ""]]
@@ -114,7 +114,7 @@ def _heating_constants(scales: Scales) -> list[float]:
 
 
 @register
-class SelfHeating(AbstractSelfHeating):
+class SelfHeating(_AbstractSelfHeating):
     r"""A gain in proportion to the temperature that the piezo's hysteresis brings about.
 
     .. math:: w_0 + (w - w_0) (1 + b (\mathrm{LP}_\tau[|u \dot u|] / p_0 + h e^{-t / \tau}))
@@ -169,7 +169,7 @@ class SelfHeating(AbstractSelfHeating):
 
 
 @register
-class ResistiveHeating(AbstractSelfHeating):
+class ResistiveHeating(_AbstractSelfHeating):
     r"""A gain in proportion to the temperature that currents bring about in the piezo's electrodes and leads.
 
     .. math:: w_0 + (w - w_0) (1 + b (\mathrm{LP}_\tau[\dot w^2] / v_0^2 + h e^{-t / \tau}))
