@@ -29,6 +29,8 @@ from fits.stats._noise import rough_noise_um
 # Voltages that are tried over the range, the part of their distance to which the best is found, and how much larger
 # the Bayesian information criterion must be without.
 _TRIED, _FINE, _LEAST = 25, 1e-3, 10.0
+# Noise of a sensor, as a part of its range, of which there is hardly any less.
+_NOISELESS = 1e-6
 # Mean square that is left where the past counts, over that later, from which on it is looked into, and the part of a
 # run that is later at least.
 _MORE, _LATER = 1.1, 0.1
@@ -170,7 +172,9 @@ def _before_V(stage: m.Stage, run: Run) -> tuple[float, ...]:
     guess = run.start if run.record.before_V else memory_before(stage, run, alone_um + offset_um, noise_um)
     from fits.stage._turned import memory_behind  # its solver takes long to import
 
-    found = memory_behind(stage, run, guess, rough_noise_um(left_um[run.fitted]))
+    # Simulated readings may have none.
+    sensor_um = max(rough_noise_um(left_um[run.fitted]), _NOISELESS * float(np.ptp(run.displacement_um)))
+    found = memory_behind(stage, run, guess, sensor_um)
     return tuple(np.asarray(found.extremes_V)[: int(found.count)].tolist())
 
 
