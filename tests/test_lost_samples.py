@@ -1,5 +1,7 @@
 """Readings that repeat the one before them: found, and only where samples were lost."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from _wrong_records import said
@@ -97,3 +99,9 @@ def test_a_fit_leaves_lost_samples_out_and_says_so(rng):
     # Left in, samples that are off by up to 0.1 um would be many times the noise of 5 nm.
     errors = [each.runs[0].held_out.rms_um for each in (rest, whole)]
     assert errors[0] == pytest.approx(errors[1], rel=0.15)
+
+
+def test_marks_are_one_for_each_sample(rng):
+    record = moving(rng)
+    with pytest.raises(fits.DataError, match="lost has shape"):
+        replace(record, lost=np.ones(3, dtype=bool))

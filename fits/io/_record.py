@@ -60,6 +60,8 @@ class Record(AbstractSummary):
         extra = {name: read_only(name, values) for name, values in self.extra.items()}
         _settle(self, ("time_s", "voltage_V", "displacement_um"), extra, " as time_s")
         object.__setattr__(self, "extra", MappingProxyType(extra))
+        if self.lost.any() and self.lost.shape != (len(self),):
+            raise DataError(f"lost has shape {self.lost.shape}, expected ({len(self)},) as time_s.")
         object.__setattr__(self, "lost", self.lost.copy() if self.lost.any() else np.zeros(len(self), dtype=bool))
         self.lost.flags.writeable = False
 

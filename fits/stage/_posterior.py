@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 from fits.io._errors import DataError
 from fits.io._record import Record
 from fits.loop._design import Grid, columns_of
-from fits.loop._lost import without_lost
 from fits.loop._prior import Hyper
 from fits.loop._result import FitResult
 from fits.loop._run import Progress, Run, Samples, command_range_V
@@ -171,7 +170,6 @@ def _runs(result: FitResult[Stage], records: Sequence[Record], initial: str, hol
     range_V = range_of(result.model)
     if not np.isfinite(range_V[0]):
         range_V = command_range_V(records)
-    records, _ = without_lost(records, holdout)
     runs = prepare_again(result, records, [initial] * len(records), holdout, range_V)
     stage = result.model.with_substeps(1)
     weights = weights_beside_pasts(runs, [residual_of(stage, run) for run in runs])

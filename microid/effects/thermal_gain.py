@@ -84,6 +84,17 @@ class ThermalGain(AbstractEffect):
 class _AbstractSelfHeating(AbstractEffect):
     """A gain in proportion to the temperature that the piezo's own losses bring about; see its two forms."""
 
+    name: ClassVar[str] = "thermal_gain"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain",)
+    history: ClassVar[tuple[str, ...]] = ("before",)
+    fingerprint: ClassVar[str] = ThermalGain.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
+    experiment: ClassVar[str] = ThermalGain.experiment
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
     gain: AbstractVar[Float[Array, ""]]
     time_constant_s: AbstractVar[Float[Array, ""]]
     zero_um: AbstractVar[Float[Array, ""]]
@@ -133,21 +144,10 @@ class SelfHeating(_AbstractSelfHeating):
         `h`: how warm it was when the record began, as losses of so many times `p0` make it in the end.
     """
 
-    name: ClassVar[str] = "thermal_gain"
     form: ClassVar[str] = "self_heating"
-    takes: ClassVar[str] = "um"
-    gives: ClassVar[str] = "um"
-    place: ClassVar[Place] = "hysteresis"
-    strength: ClassVar[tuple[str, ...]] = ("gain",)
-    history: ClassVar[tuple[str, ...]] = ("before",)
-    fingerprint: ClassVar[str] = ThermalGain.fingerprint
-    confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
-    experiment: ClassVar[str] = ThermalGain.experiment
     source: ClassVar[str] = (
         "Noliac tutorial on heat dissipation: 30 to 70 K; Actuators 10 (2021) 297: amplitude 15 % more at 10 kHz"
     )
-    view: ClassVar[View] = "time"
-    column: ClassVar[str] = "temperature_degC"
     gain: Float[Array, ""] = param(unit="1", scale=0.01)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
     reference_V2_per_s: Float[Array, ""] = array()
@@ -182,19 +182,8 @@ class ResistiveHeating(_AbstractSelfHeating):
         `v0`, given.
     """
 
-    name: ClassVar[str] = "thermal_gain"
     form: ClassVar[str] = "resistive_heating"
-    takes: ClassVar[str] = "um"
-    gives: ClassVar[str] = "um"
-    place: ClassVar[Place] = "hysteresis"
-    strength: ClassVar[tuple[str, ...]] = ("gain",)
-    history: ClassVar[tuple[str, ...]] = ("before",)
-    fingerprint: ClassVar[str] = ThermalGain.fingerprint
-    confusions: ClassVar[tuple[str, ...]] = ThermalGain.confusions
-    experiment: ClassVar[str] = ThermalGain.experiment
     source: ClassVar[str] = "Joule's law, the current of a capacitance being in proportion to the rate of its voltage"
-    view: ClassVar[View] = "time"
-    column: ClassVar[str] = "temperature_degC"
     gain: Float[Array, ""] = param(unit="1", scale=0.01)
     time_constant_s: Float[Array, ""] = param(unit="s", scale=100.0, lower=_SOONEST_s, upper=1e6)
     reference_um_per_s: Float[Array, ""] = array()
