@@ -10,7 +10,7 @@ import microid as m
 from fits import Record
 from fits.loop._run import prepare_run
 from fits.stage._began import as_begun
-from fits.stage._run import residual_of
+from fits.stage._run import fitted_past, residual_of, respond
 
 RATE_Hz, COUNT, PARTS, NOISE = 2000.0, 1500, 4, 1e-4
 
@@ -104,3 +104,29 @@ def left_through_a_resonance(rng):
 
     run = prepared(Record(fine_s[::PARTS], command_V[::PARTS], read_um))
     return float(np.std(residual_of(stage, prepared(*as_begun(stage, [run])))) / np.std(residual_of(stage, run)))
+
+
+def test_a_past_that_ends_with_the_first_samples_is_no_larger_than_the_hysteresis_can_make_it(rng):
+    """Without a bound it was up to twice the stroke, the stage being off by 1 in 3,000, and free motions undid it."""
+    model, lag_s, natural = random_model(rng, 16), 8e-4, 2 * np.pi * 350
+    lower, upper = limits_V(model)
+    span = upper - lower
+    stage = m.Stage.of(driver=m.Driver(lag_s), hysteresis=model, mechanics=m.Mechanics(natural / (2 * np.pi), 0.06))
+    levels = np.concatenate([[0.02, 0.98, 0.1], rng.uniform(0.05, 0.95, 20)])
+    shares = levels[np.minimum(np.arange(COUNT) // 70, len(levels) - 1)]
+    shares[0] = 0.14
+    command_V = lower + span * shares
+    fine_s = np.arange((COUNT - 1) * 16 + 1) / 2800 / 16
+    fine_V = np.interp(fine_s, fine_s[::16], command_V)
+    driven_V = fine_V[0] + lsim(([1.0], [lag_s, 1.0]), fine_V - fine_V[0], fine_s)[1]
+    before_V = np.array([lower, lower + rng.uniform(0.2, 0.8) * span, command_V[0]])
+    given_um = np.asarray(model(jnp.asarray(np.concatenate([before_V, driven_V]))))[len(before_V) :]
+    rung = lsim(([natural**2], [1.0, 0.12 * natural, natural**2]), given_um - given_um[0], fine_s)[1]
+    read_um = given_um[0] + rung[::16]
+    stroke_um = np.ptp(read_um)
+    read_um += stroke_um * (NOISE * rng.standard_normal(COUNT) + 3e-4 * np.sin(6 * np.pi * shares))
+    record = Record(fine_s[::16], command_V, read_um)
+    run = prepare_run(record, (lower, upper), "unknown", 0.0, 2, estimated=True)
+    left_um = run.samples.displacement_um - respond(stage, run.samples)
+    past_um = np.asarray(fitted_past(stage, run.samples, run.coarser.samples, left_um))
+    assert np.abs(past_um).max() < 0.1 * stroke_um

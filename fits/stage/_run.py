@@ -107,14 +107,22 @@ def fitted_past(
 ) -> Float[Array, " m"]:
     """What the unknown past of a run makes its hysteresis give, in um, at the refined times, shape `(m,)`.
 
-    It is fitted, beside the other nuisance parameters as `coarser` samples show them, to what a stage leaves.
+    It is fitted, beside the other nuisance parameters as `coarser` samples show them, to what a stage leaves. All
+    relays together add half the stroke at most, which is the standard deviation of the sum of all factors beforehand:
+    of a past that ends with the first samples readings say little beside how the stage moved.
     """
     place = place_of_hysteresis(stage)
     if place is None:
         return jnp.zeros_like(samples.voltage_V)
     past, _ = _past_ahead(stage, place, samples)
+    columns, weight = nuisance_columns(stage, coarser), samples.weight
+    noise_um2 = jnp.average(project_out(columns, weight, left_um) ** 2, weights=weight)
+    counts = jnp.where(weight > 0, samples.displacement_um, jnp.nan)
+    stroke_um = jnp.nanmax(counts) - jnp.nanmin(counts)
     # Ahead of them is the offset.
-    return past @ _best_factors(nuisance_columns(stage, coarser), samples.weight, left_um)[1 : 1 + past.shape[1]]
+    own, number = slice(1, 1 + past.shape[1]), past.shape[1]
+    ridge = jnp.zeros(columns.shape[1]).at[own].set(noise_um2 * number / (stroke_um / 2) ** 2)
+    return past @ _best_factors(columns, weight, left_um, ridge)[own]
 
 
 def answered(
@@ -154,13 +162,13 @@ def project_out(
 
 
 def _best_factors(
-    columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"]
+    columns: Float[Array, "n k"], weight: Float[Array, " n"], values: Float[Array, " n"], ridge: Any = 0.0
 ) -> Float[Array, " k"]:
-    """Of columns, by weighted least squares."""
+    """Of columns, by weighted least squares; `ridge` is the precision of each beforehand, `(k,)`."""
     scale = jnp.sqrt(jnp.sum(weight[:, None] * columns**2, axis=0)) + _TINY
     scaled = columns / scale[None, :]
     weighted = weight[:, None] * scaled
-    gram = scaled.T @ weighted + _TINY * jnp.eye(columns.shape[1])
+    gram = scaled.T @ weighted + jnp.diag(jnp.broadcast_to(ridge / scale**2 + _TINY, scale.shape))
     return jnp.linalg.solve(gram, weighted.T @ values) / scale
 
 
