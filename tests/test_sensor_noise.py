@@ -38,6 +38,22 @@ def test_spikes_are_found_and_ringing_is_not(rng):
     assert set(spikes_in(np.sin(time), left)) == {*where, *(where[::3] + 7)}
 
 
+def test_spikes_are_found_while_the_command_moves_where_they_are_as_many_as_elsewhere(rng):
+    """One in a hundred samples, so that one in eight stretches that move has one."""
+    n = 4000
+    voltage = np.where(np.arange(n) < 2000, 50.0, 50 + 40 * np.sin(np.arange(n) * 0.7))
+    quiet = 0.02 * rng.standard_normal(n)
+    where = np.sort(rng.permutation(np.arange(20, n, 40))[:40])
+    spoilt = quiet.copy()
+    spoilt[where] += rng.choice([-1, 1], 40) * rng.uniform(0.6, 3.0, 40)
+    assert set(spikes_in(voltage, spoilt)) == set(where)
+    # Of those that come only where the command moves, it may be the cause.
+    moved = quiet.copy()
+    moving = np.arange(2020, n, 40)
+    moved[moving] += rng.choice([-1, 1], len(moving)) * rng.uniform(0.9, 1.1, len(moving))
+    assert len(spikes_in(voltage, moved)) == 0
+
+
 def test_a_last_digit_is_found_and_noise_has_none(rng):
     values = 20 * np.sin(np.arange(6000) / 300) + 0.01 * rng.standard_normal(6000)
     assert quantum_um(values) == 0

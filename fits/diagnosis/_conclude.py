@@ -60,9 +60,9 @@ def conclude(
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
     baseline, thresholds = ready.baseline, ready.reading.thresholds
-    beside = (
-        find_faults(found.projector.regression, found.model.change_um, thresholds) if found.causes else ready.faults
-    )
+    now = found.projector
+    beside = find_faults(now.regression, found.model.change_um, thresholds, now.roughness)
+    beside = beside if found.causes else replace(ready.faults, band=beside.band)
     # What there is to be explained is all that the sensor does not make, the model's discrepancy, too.
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.

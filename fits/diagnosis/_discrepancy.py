@@ -8,7 +8,8 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import minimize
 
-from fits.diagnosis._projector import Projector, orthonormal, take_off
+from fits.diagnosis._orthonormal import orthonormal, take_off
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import root_of
 from fits.loop._grid import EVIDENCE_LEVELS
 from fits.loop._moments import Moments

@@ -45,9 +45,19 @@ class Faults:
     remarks: tuple[str, ...] = ()
 
     @property
+    def count(self) -> int:
+        """Number of spikes."""
+        return sum(int(s.sum()) for s in self.spikes)
+
+    @property
     def repaired(self) -> bool:
         """Whether there are enough spikes to be taken out."""
-        return sum(int(s.sum()) for s in self.spikes) >= _FEWEST_SPIKES
+        return self.count >= _FEWEST_SPIKES
+
+    def beside(self, others: "Faults") -> "Faults":
+        """The same with the spikes of others, without which these were found."""
+        spikes = tuple(map(np.logical_or, self.spikes, others.spikes))
+        return replace(self, spikes=spikes, heights_um=tuple(map(np.add, self.heights_um, others.heights_um)))
 
     def is_narrow(self, thresholds: Thresholds) -> bool:
         """Whether there is a narrow band beyond chance that is no hum."""
@@ -78,9 +88,12 @@ class Faults:
 
 
 def find_faults(
-    regression: Regression, change_um: Sequence[np.ndarray] | None = None, thresholds: Thresholds = THRESHOLDS
+    regression: Regression,
+    change_um: Sequence[np.ndarray] | None = None,
+    thresholds: Thresholds = THRESHOLDS,
+    roughness: Sequence[float] = (),
 ) -> Faults:
-    """Look at what a fitted plain stage leaves of each run, sample by sample.
+    """Look at what a fitted plain stage leaves of each run, sample by sample, its density being so rough.
 
     Where effects are known, `change_um` is what they change in each run, shape `(n,)`, and is taken off before.
     """
@@ -90,8 +103,8 @@ def find_faults(
     baseline = regression.baseline
     used = (left[mask] for left, mask in zip(regression.residuals, regression.masks, strict=True))
     guess = [white_noise(max(rough_noise_um(left), 1e-9 * baseline.stroke_um)) for left in used]
-    projector = Projector(regression, guess)
-    dz, dw = projector.step(projector.residual)
+    projector = Projector(regression, guess, roughness)
+    followed = projector.follow(projector.residual)
     quantum = max(quantum_um(run.displacement_um) for run in baseline.runs)
     # Rounding is noise that a command at rest does not show.
     least = quantum / 12**0.5
@@ -99,9 +112,9 @@ def find_faults(
     poles = np.asarray(baseline.stage.poles_rad_per_s).real if baseline.dynamic else np.zeros(0)
     # After so many e-folds a motion has settled.
     settling_s = float(8.0 / max(np.min(np.abs(poles)), 1e-3)) if len(poles) else 0.0
-    fitted = zip(baseline.runs, regression.rows, regression.nuisance, regression.residuals, strict=True)
-    for run, rows, nuisance, residual in fitted:
-        moved = residual - rows @ np.concatenate([dw, dz])
+    fitted = zip(baseline.runs, followed, regression.nuisance, regression.residuals, strict=True)
+    for run, follow, nuisance, residual in fitted:
+        moved = residual - follow
         mask = run.fitted
         left = moved - nuisance @ np.linalg.lstsq(nuisance[mask], moved[mask], rcond=None)[0]
         # What was written for lost samples is no reading.

@@ -64,6 +64,8 @@ _BEYOND = (
     "{} goes to {:.4g} V, and what was fitted from {:.4g} to {:.4g} V only: how it moves there, and what it "
     "remembers of that, is not known from these runs, so that an error there says little of causes"
 )
+# Times that bad samples are taken out and looked for again: they pull a stage towards themselves, and hide others.
+_CLEANED = 3
 # Part of the range by which a run held out may go beyond what was fitted.
 _LITTLE = 0.01
 # Part of the intervals in which a command in steps stays where it is.
@@ -146,10 +148,12 @@ def fit_plain_stage(
     progress("fitting the plain stage again, without single bad samples")
     # Where an effect passes for bad samples, what runs show no poles of they show none of without these.
     left_out = () if regression.baseline.dynamic else regression.baseline.remarks
-    regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem, left_out))
-    found = find_faults(regression, None, reading.thresholds)
-    found = replace(found, spikes=faults.spikes, heights_um=faults.heights_um)
-    return PlainFit(regression, found, reading.thresholds)
+    for _ in range(_CLEANED):
+        regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem, left_out))
+        known, faults = faults, find_faults(regression, None, reading.thresholds).beside(faults)
+        if faults.count == known.count:
+            break
+    return PlainFit(regression, faults, reading.thresholds)
 
 
 def decide_plain_stage(

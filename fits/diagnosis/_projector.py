@@ -10,6 +10,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from scipy.linalg.lapack import dpstrf
 
 from fits.diagnosis._baseline import Baseline
+from fits.diagnosis._orthonormal import AT_ONCE, SHOWN, inverse_root
 from fits.diagnosis._regression import Regression, regress
 from fits.io._threads import map_in_threads
 from fits.loop._grid import non_negative
@@ -18,14 +19,10 @@ from fits.loop._result import FitError, FitStatus
 from fits.stats._compare import surprise
 from fits.stats._noise import Noise
 
-# Part of a column of the tangent, in squares, below which what the others leave of it is rounding.
-_SHOWN = 1e-9
 # Standard deviations by which the data press a column that is zero below that, beyond chance.
 _PRESSED_Z = 3.0
 # The farthest that a coordinate moves at a time.
 _FARTHEST = 3.0
-# Signals that are projected at once.
-_AT_ONCE = 64
 
 
 class Projector:
@@ -109,7 +106,7 @@ class Projector:
         held = np.pad(self.held, (0, len(self._scale) - len(self.held)))
         self._moving = np.flatnonzero(~(held if any(self.roughness) else held | self._is_rough))
         # A Cholesky factor, pivoted: columns that the others make up have nothing of their own to be projected on.
-        factor, pivots, rank, _ = dpstrf(self._gram[np.ix_(self._moving, self._moving)], tol=_SHOWN, lower=1)
+        factor, pivots, rank, _ = dpstrf(self._gram[np.ix_(self._moving, self._moving)], tol=SHOWN, lower=1)
         lower, order = np.tril(factor)[:, :rank], self._moving[pivots - 1]
         self._inverse = np.zeros((len(self._scale), rank))
         self._inverse[order[:rank]] = solve_triangular(lower[:rank], np.eye(rank), lower=True).T
@@ -147,12 +144,12 @@ class Projector:
         joined = self.residual - self.join(change_um) if len(change_um) else self.residual
         cross = self._matrix.T @ joined
         at, others = np.flatnonzero(zero), np.setdiff1d(np.arange(len(cross)), np.flatnonzero(zero))
-        half = _inverse_root(gram[np.ix_(others, others)])
+        half = inverse_root(gram[np.ix_(others, others)])
         along = gram[np.ix_(at, others)] @ half
         left = np.diagonal(gram)[at] - np.sum(along**2, axis=1)
         best = cross[at] - along @ (half.T @ cross[others])
         held = np.zeros(len(zero), dtype=bool)
-        held[at] = best < -_PRESSED_Z * np.sqrt(np.maximum(left, _SHOWN))
+        held[at] = best < -_PRESSED_Z * np.sqrt(np.maximum(left, SHOWN))
         return self if np.array_equal(held, self.held) else self._sharing(held, self.roughness)
 
     @property
@@ -194,8 +191,8 @@ class Projector:
             stop = row + int(mask.sum())
             if out.ndim == 1:
                 out[row:stop] = noise.whiten(signal)[mask]
-            for at in range(0, out.shape[1] if out.ndim > 1 else 0, _AT_ONCE):
-                out[row:stop, at : at + _AT_ONCE] = noise.whiten(signal[:, at : at + _AT_ONCE])[mask]
+            for at in range(0, out.shape[1] if out.ndim > 1 else 0, AT_ONCE):
+                out[row:stop, at : at + AT_ONCE] = noise.whiten(signal[:, at : at + AT_ONCE])[mask]
             row = stop
         return out
 
@@ -207,10 +204,10 @@ class Projector:
         """Project joined signals off the tangent in place and many at once: of long records they fill the memory."""
 
         def take(at: int) -> None:
-            joined[:, at : at + _AT_ONCE] = self.off(joined[:, at : at + _AT_ONCE])
+            joined[:, at : at + AT_ONCE] = self.off(joined[:, at : at + AT_ONCE])
 
         self._matrix  # noqa: B018  computed here and not in each thread
-        map_in_threads(take, range(0, joined.shape[1], _AT_ONCE))
+        map_in_threads(take, range(0, joined.shape[1], AT_ONCE))
 
     def split(self, joined: np.ndarray) -> list[np.ndarray]:
         """Cut a joined signal into those of the runs, whitened, at the samples that count."""
@@ -236,7 +233,7 @@ class Projector:
     def _spread(self) -> np.ndarray:
         """Root of the covariance, in the order of its eigenvalues: that of pivots is up to rounding."""
         value, vector = np.linalg.eigh(self._gram[np.ix_(self._moving, self._moving)])
-        shown = value > _SHOWN / 10 * value[-1]
+        shown = value > SHOWN / 10 * value[-1]
         spread = np.zeros((len(self._scale), int(shown.sum())))
         spread[self._moving] = vector[:, shown] / np.sqrt(value[shown])
         return spread
@@ -251,6 +248,16 @@ class Projector:
         answer = (spread @ rng.standard_normal(spread.shape[1])) / self._scale
         columns = self.regression.baseline.chain.size
         return answer[columns : self.regression.size], answer[:columns]
+
+    def follow(self, joined: np.ndarray) -> list[np.ndarray]:
+        """What the baseline, and roughness of its density, make of the best steps along a joined signal, `(n,)` each.
+
+        The runs' nuisance parameters follow, too, and are no part of it.
+        """
+        answer = self._answer(joined)
+        kinds = [self.regression.rows, *(kind for kind, _ in self._rough)]
+        parts = np.split(answer, np.cumsum([kind[0].shape[1] for kind in kinds]))
+        return [sum(kind[k] @ part for kind, part in zip(kinds, parts, strict=False)) for k in range(len(self.masks))]
 
     def _answer(self, joined: np.ndarray) -> np.ndarray:
         return (self._inverse @ self.along(joined)) / self._scale
@@ -313,35 +320,3 @@ class Projector:
             raise FitError(FitStatus.MAX_STEPS)
         others = alone - follow @ (np.asarray(kept) - baseline.columns_um)
         return others[coordinate], np.asarray(kept)
-
-
-def orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that span others, shape `(rows, k)`, without those that the others make up.
-
-    By a pivoted Cholesky factor of their Gram matrix, twice: the first time rounding leaves them a little askew.
-    """
-    for _ in range(2):
-        gram = columns.T @ columns
-        scale = 1 / (np.sqrt(np.diagonal(gram)) + 1e-300)
-        columns = columns @ (scale[:, None] * _inverse_root(scale[:, None] * gram * scale))
-    return columns
-
-
-def take_off(joined: np.ndarray, basis: np.ndarray) -> None:
-    """Project joined signals off orthonormal columns, in place and many at once: of long records they fill memory."""
-
-    def take(at: int) -> None:
-        columns = joined[:, at : at + _AT_ONCE]
-        columns -= basis @ (basis.T @ columns)
-
-    map_in_threads(take, range(0, joined.shape[1], _AT_ONCE))
-
-
-def _inverse_root(gram: np.ndarray) -> np.ndarray:
-    """Matrix that makes columns of a Gram matrix orthonormal, shape `(k, rank)`, without what others make up."""
-    if len(gram) == 0:
-        return gram
-    factor, pivots, rank, _ = dpstrf(gram, tol=_SHOWN, lower=1)
-    out = np.zeros((len(gram), rank))
-    out[pivots[:rank] - 1] = solve_triangular(np.tril(factor)[:rank, :rank], np.eye(rank), lower=True).T
-    return out

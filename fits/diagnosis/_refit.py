@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fits.diagnosis._effects import Bench, Law, remembering, strength_of
-from fits.diagnosis._projector import Projector, orthonormal
+from fits.diagnosis._orthonormal import orthonormal
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Scored, law_of
 from fits.io._threads import map_in_threads
 from fits.io.columns import columns_beside

@@ -9,7 +9,8 @@ from scipy import stats
 
 from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._effects import Bench, Law, times, without_host
-from fits.diagnosis._projector import Projector, take_off
+from fits.diagnosis._orthonormal import take_off
+from fits.diagnosis._projector import Projector
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
 from fits.stats._score_test import best_multiples, evidence, evidence_of, robust_z, squares

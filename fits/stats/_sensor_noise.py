@@ -19,8 +19,9 @@ _MOST_TOGETHER, _COMPARED_SAMPLES = 3, 16
 # A command that moves, or turns, by more than these parts of its range within so many samples may cause what looks
 # like a spike.
 _MOVED_SHARE, _TURNED_SHARE, _SAMPLES_AROUND = 0.02, 0.004, 6
-# There a spike is larger than this multiple of what is usual.
-_OUTLYING = 2.0
+# There a spike is larger than this multiple of what is usual, unless there are so many elsewhere that they are seen
+# to be as many there, within so many standard deviations.
+_OUTLYING, _FEWEST_ELSEWHERE, _CHANCE_Z = 2.0, 4, 3.0
 # Median of the negative product of neighbouring bends of white noise of variance 1, by simulation.
 _OPPOSED = 0.3726
 # Jitter beside rounding has at least so many times its variance.
@@ -143,9 +144,10 @@ def spikes(voltage_V: np.ndarray, residual_um: np.ndarray, least_um: float, spik
     moved = (np.abs(change) > _MOVED_SHARE * float(np.ptp(voltage_V))) | turned
     width = 2 * _SAMPLES_AROUND + 1
     near = np.convolve(moved, np.ones(width), mode="same") > 0.5
-    # Where it may, others do so, too: one sample in fifty, and one in a tenth of the places.
+    # Where it may, others do so, too: one sample in fifty, and one in a tenth of the places. What comes no more often
+    # there than elsewhere it does not cause.
     places = [slice(k, min(k + width, stop)) for first, stop in stretches(near) for k in range(first, stop, width)]
-    if places:
+    if places and _is_more_often(far, near):
         usual = _OUTLYING * float(np.quantile(size[near], 0.98))
         usual = max(usual, float(np.quantile([size[place].max() for place in places], 0.9)))
         far &= ~near | (size > _OUTLYING * usual)
@@ -153,6 +155,16 @@ def spikes(voltage_V: np.ndarray, residual_um: np.ndarray, least_um: float, spik
         if stop - first > _MOST_TOGETHER:
             far[first:stop] = False
     return far
+
+
+def _is_more_often(marked: np.ndarray, there: np.ndarray) -> bool:
+    """Whether samples are marked more often there than elsewhere, or so seldom elsewhere that nothing is known."""
+    others, count = int(np.sum(marked & ~there)), int(np.sum(marked & there))
+    expected = others / max(np.sum(~there), 1) * float(np.sum(there))
+    if others < _FEWEST_ELSEWHERE:
+        return True
+    # Either number is Poisson's.
+    return bool(count > expected + _CHANCE_Z * (expected + expected**2 / others) ** 0.5)
 
 
 def jitter_s(
