@@ -21,8 +21,8 @@ from fits.diagnosis._extension import (
     without_effects,
 )
 from fits.diagnosis._findings import bounds, causes_of, with_held_gain
-from fits.diagnosis._misfit import SHOWN, worth_naming
-from fits.diagnosis._noise import Faults, find_faults, name_faults
+from fits.diagnosis._misfit import SHOWN, faults_beside, worth_naming
+from fits.diagnosis._noise import Faults, name_faults
 from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared, of_half_a_sample, of_holds_aside
 from fits.diagnosis._refit import Refit
 from fits.diagnosis._residual_tests import explain, further_regressors, irregular, run_regressors
@@ -60,9 +60,7 @@ def conclude(
     # With the noise that was found in the end.
     ready = replace(ready, projector=found.first)
     baseline, thresholds = ready.baseline, ready.reading.thresholds
-    now = found.projector
-    beside = find_faults(now.regression, found.model.change_um, thresholds, now.roughness)
-    beside = beside if found.causes else replace(ready.faults, band=beside.band)
+    found, beside, quiet = faults_beside(ready, found)
     # What there is to be explained is all that the sensor does not make, the model's discrepancy, too.
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
@@ -123,12 +121,10 @@ def conclude(
             "interferometer or an encoder does, and a hysteresis of few plays"
         )
     rest_um = rest_noise * unit_um if left_over else 0.0
-    faults = _standing(
-        ready.faults, beside if kept else ready.faults, extension.compared, rest_um, thresholds.spike_z
-    )
+    faults = _standing(beside if kept else quiet, extension.compared, rest_um, thresholds.spike_z)
     unlike, in_bursts = irregular(told.first, told.plain.residual, thresholds)
     bursts = in_bursts and not kept and not rounded
-    rings = faults.is_narrow(thresholds) and faults.rings_itself(baseline.resonance_Hz, thresholds)
+    rings = faults.makes_noise(thresholds) and faults.rings_itself(baseline.resonance_Hz, thresholds)
     lone = faults.band.alone and faults.makes_noise(thresholds) and not cyclic
     named = name_faults(faults, cyclic, bursts or rings or lone, thresholds)
     removed = misfit.share, misfit.explained / misfit.count * unit_um**2
@@ -311,14 +307,14 @@ def _gain(
     return gain, sorted(own)
 
 
-def _standing(faults: Faults, beside: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float) -> Faults:
-    """Faults of samples and noise beside the causes and a rest, which may make what looked like a bad sample."""
+def _standing(faults: Faults, compared: Sequence[Compared], rest_um: float, spike_z: float) -> Faults:
+    """Faults of samples and noise beside a rest, which may make what looked like a bad sample."""
     # Where much is left, a small one would stand out of zero by that alone.
     spikes = tuple(
         bad & (np.minimum(np.abs(one.after_um + um), np.abs(um)) > spike_z * float(np.hypot(noise.total_um, rest_um)))
-        for bad, um, one, noise in zip(faults.spikes, faults.heights_um, compared, beside.noise, strict=False)
+        for bad, um, one, noise in zip(faults.spikes, faults.heights_um, compared, faults.noise, strict=False)
     )
-    return replace(beside, spikes=spikes, heights_um=faults.heights_um)
+    return replace(faults, spikes=spikes)
 
 
 def _may_be_worse_z(doubts: int, thresholds: Thresholds) -> float:

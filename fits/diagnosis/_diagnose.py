@@ -32,8 +32,8 @@ _CHECK = 0.12
 # Parts of the budget after which the stage is not fitted in yet another way, no more effects are asked for as what
 # was found is refined in the rest, and intervals of what was found are not followed.
 _PREPARED, _ASKED, _REFINED = 0.5, 0.65, 0.85
-# What is no part of the noise that was learnt, and is predicted as little.
-_UNRULY = ("band", "spikes")
+# What is no part of the noise that is said, and is predicted as little.
+_UNRULY = ("band", "jitter", "spikes")
 # Mean square of the errors in what was held out, in noise variances, that no chance explains.
 _UNLIKE = 1.5
 _ALL = (
@@ -173,7 +173,7 @@ def diagnose(
     reading = Reading(records, aside, fraction, initial, thresholds)
     diagnosis = answer(reading)
     gain = diagnosis.gain
-    # A vibration is noise, and so are bad samples, and nothing that was held out would tell more of them.
+    # A vibration is noise, and so are bad samples: nothing that was held out would tell more of them.
     unruly = [cause.rms_um for cause in diagnosis.causes if card_of(cause.name).statistic in _UNRULY]
     heard_um2 = gain.noise_um**2 + sum(rms_um**2 for rms_um in unruly)
     least_um2 = max(_UNLIKE * heard_um2, (1 - thresholds.minor_share) * gain.heldout_rms_before_um**2)

@@ -6,7 +6,9 @@ import numpy as np
 from scipy import stats
 
 from fits.diagnosis._explanation import Selection
+from fits.diagnosis._noise import Faults, find_faults
 from fits.diagnosis._prepare import Prepared
+from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import Refit, nothing, refit
 from fits.diagnosis._residual_tests import explain_together, is_flicker, repeats_in, run_regressors
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
@@ -78,15 +80,33 @@ class Misfit:
         return rest, rest > self.thresholds.rest_noise or not (weak or self.share < self.thresholds.minor_share)
 
 
-def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
-    """What was found, in units of other noise."""
-    first = found.first.beside(noise)
-    # Where all causes were left out, nothing was learnt beside them.
-    now = found.projector.beside(noise) if found.causes else first
+def faults_beside(ready: Prepared, found: Selection) -> tuple[Selection, Faults, Faults]:
+    """What was found, without bad samples that show beside it; faults beside it, and with none of it named."""
+    thresholds, projector, before = ready.reading.thresholds, found.projector, ready.faults
+    faults = find_faults(projector.regression, found.model.change_um, thresholds, projector.roughness)
+    if not found.causes:
+        # What a density explains that is rougher than its grid is no band.
+        quiet = replace(before, band=faults.band)
+        return found, quiet, quiet
+    beside = faults.beside(before)
+    if beside.count > before.count:
+        found = _anew(found, *(p.with_readings_less(faults.heights_um) for p in (found.first, found.projector)))
+    return found, beside, before
+
+
+def _anew(found: Selection, first: Projector, now: Projector) -> Selection:
+    """What was found, beside other noise or in other readings."""
     plain = nothing(found.bench, first)
     model = refit(found.bench, now, found.model.laws, found.model.x, 2) if found.causes else plain
     explained = max(plain.cost - model.cost, 0.0)
     return replace(found, first=first, projector=now, plain=plain, model=model, explained=explained)
+
+
+def _in_noise(found: Selection, noise: tuple[Noise, ...]) -> Selection:
+    """What was found, in units of other noise."""
+    first = found.first.beside(noise)
+    # Where all causes were left out, nothing was learnt beside them.
+    return _anew(found, first, found.projector.beside(noise) if found.causes else first)
 
 
 def worth_naming(

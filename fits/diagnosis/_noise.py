@@ -134,7 +134,8 @@ def find_faults(
         voltage_V, mask = run.record.voltage_V, run.fitted
         settings = settling_s, 1e-9 * float(np.ptp(run.displacement_um)), thresholds.apart_z, thresholds.minor_share
         floors.append(floor_of(voltage_V, smooth, mask, run.rate_Hz, *settings))
-        rate = np.gradient(position, run.record.time_s)
+        # Differences of a few samples in a period are less than its slope.
+        rate = scipy.interpolate.CubicSpline(run.record.time_s, position)(run.record.time_s, 1)
         size, z, most = jitter_s(smooth[mask], rate[mask], least, thresholds.apart_z)
         jitters.append((z, size, np.abs(rate), most))
         interval_s = float(np.median(np.diff(run.record.time_s)))

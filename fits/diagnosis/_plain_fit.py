@@ -290,8 +290,8 @@ class PlainFit:
         there = other.in_noise_of(self)
         whole, here, noise = (float(there.left @ there.left), float(self.left @ self.left), len(there.left))
         if "zero" in other.holds:
-            # Of noise alone nothing would leave less.
-            if whole <= (1 + _NOISE) * noise:
+            # What does not count as unexplained is noise, of which nothing would leave less.
+            if whole <= (1 + self.thresholds.rest_noise**2) * noise:
                 return False
             lines, steps = (min(one.left_beside_best, one.left_beside_lag()) for one in (self, there))
             return lines < steps - max(self.thresholds.other_hold_z**2, _PLAIN * (steps - noise))

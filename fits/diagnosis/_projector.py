@@ -134,6 +134,11 @@ class Projector:
         other = self.noise if noise is None else noise, self.roughness if roughness is None else roughness
         return Projector(self.regression, *other, self.held)
 
+    def with_readings_less(self, heights_um: Sequence[np.ndarray]) -> "Projector":
+        """The same with readings that are less by some heights, shape `(n,)` per run."""
+        residuals = tuple(map(np.subtract, self.regression.residuals, heights_um))
+        return Projector(replace(self.regression, residuals=residuals), self.noise, self.roughness, self.held)
+
     def bounded(self, change_um: Sequence[np.ndarray] = ()) -> "Projector":
         """Hold the columns that are zero and that the data press below that, under what effects change in each run.
 

@@ -176,7 +176,8 @@ def jitter_s(
     """
     bent = residual_um[1:-1] - (residual_um[2:] + residual_um[:-2]) / 2
     square = bent**2 / 1.5
-    speed = rate_um_per_s[1:-1] ** 2
+    # So do the instants of all three.
+    speed = (rate_um_per_s[1:-1] ** 2 + (rate_um_per_s[2:] ** 2 + rate_um_per_s[:-2] ** 2) / 4) / 1.5
     order = np.argsort(speed[:-1])
     slow, quick = order[: len(order) // 2], order[-len(order) // 10 :]
     base = max(float(np.median(square[slow])) / 0.4549, least_um**2)
