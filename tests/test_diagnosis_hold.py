@@ -164,6 +164,10 @@ class Other:
     left_beside_best: float
     lag: float = np.inf
 
+    @property
+    def left_beside_late(self):
+        return self.lag
+
     def left_beside_lag(self):
         return self.lag
 
@@ -180,14 +184,23 @@ class Other:
 def test_lines_are_kept_where_curves_leave_hardly_less_once_they_are_fitted(curves, best_z, kept):
     # In noise variances; as much as 22.5 is left beside lines. The best effect there may explain less than curves.
     lines, there = np.full(10_000, 22.5**0.5), np.full(10_000, curves**0.5)
-    nothing = {"left_beside_lag": lambda: np.inf, "left_beside_delay": lambda: np.inf}
-    fit = SimpleNamespace(left=lines, largest_z=lambda: best_z, left_beside_best=1e5, **nothing)
+    late = {"left_beside_late": np.inf, "thresholds": THRESHOLDS}
+    fit = SimpleNamespace(left=lines, largest_z=lambda: best_z, left_beside_best=1e5, **late)
     assert PlainFit.outdoes(fit, Other(("smooth",), there, 1e5)) == kept
     # An effect beside one of them leaves half of what is left beside any and the other, or not.
     for less, more, far in ((11_000.0, 20_000.0, True), (16_000.0, 20_000.0, False), (9_000.0, 10_400.0, False)):
         for here, beyond in ((less, more), (more, less)):
             fit.left_beside_best = here
             assert PlainFit.outdoes(fit, Other(("smooth",), there, beyond)) == (here < beyond if far else kept)
+
+
+@pytest.mark.parametrize(("lag", "kept"), [(9_800.0, True), (9_990.0, False), (11_000.0, False)])
+def test_lines_are_kept_where_a_lag_leaves_less_beside_them_than_beside_curves(lag, kept):
+    # Beside curves nothing but noise is left with a lag, 10,000, and beside lines as much, less, or more.
+    lines, there = np.full(10_000, 3.0**0.5), np.full(10_000, 1.09**0.5)
+    late = {"left_beside_late": lag, "left_beside_best": 15_000.0, "thresholds": THRESHOLDS}
+    fit = SimpleNamespace(left=lines, largest_z=lambda: 100.0, **late)
+    assert PlainFit.outdoes(fit, Other(("smooth",), there, 15_000.0, 10_000.0)) == kept
 
 
 @pytest.mark.parametrize(

@@ -248,7 +248,7 @@ class PlainFit:
         return float(left @ left) < float(other.left @ other.left)
 
     def left_beside_lag(self) -> float:
-        """Sum of squares beside a lag of the reading, fitted from poles that the runs show together with it."""
+        """Sum of squares beside a lag of the reading, from poles that the runs show together with it."""
         probe = next((probe for probe in self.probed[0] if probe.form.lag), None)
         if probe is None:
             return np.inf
@@ -265,6 +265,11 @@ class PlainFit:
         law = law_of(max(scores, key=lambda one: one.drop), len(self.regression.baseline.runs))
         model = refit(self.bench, self.projector, [law], [law.start])
         return alternate(self.bench, self.projector, model)[-1].cost
+
+    @cached_property
+    def left_beside_late(self) -> float:
+        """Sum of squares beside a lag or a delay of the reading, which may leave noise alone, too."""
+        return min(self.left_beside_lag(), self.left_beside_delay())
 
     @cached_property
     def left_beside_best(self) -> float:
@@ -308,12 +313,12 @@ class PlainFit:
         if here <= whole and here - self.largest_z() ** 2 <= rest:
             return True
         if rest <= (1 + _NOISE) * noise:
-            return False
+            least = min(there.left_beside_late, there.left_beside_best) - self.thresholds.other_hold_z**2
+            return self.left_beside_late < least
         # Of what is more than noise either way, a small part decides nothing, unless the best effect explains less.
         if here - whole < min(_NOISE * (here - noise), self.largest_z() ** 2):
             return True
-        beside = min(self.left_beside_lag(), self.left_beside_delay())
-        return beside < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)
+        return self.left_beside_late < min((1 + _NOISE) * rest, (1 - _NOISE) * whole)
 
 
 def is_far_less(cost: float, other: float, noise: int) -> bool:
