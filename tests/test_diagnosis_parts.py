@@ -82,6 +82,12 @@ def test_the_projection_is_generalised_least_squares(rng):
     rows, covariance = rng.standard_normal((7, 15)), np.linalg.inv(design.T @ design + np.diag(prior))[:15, :15]
     open_um2 = np.einsum("ij,jk,ik->i", rows, covariance, rows)
     np.testing.assert_allclose(projector.variance_um2(rows), open_um2, rtol=1e-7)
+    # What follows a signal, but for the runs' own parameters, are the unknowns at their best.
+    best, kinds = np.linalg.solve(design.T @ design + np.diag(prior), design.T @ target), (reg.rows, *reg.finer)
+    expected = [np.concatenate([kind[k] for kind in kinds], axis=1) @ best[:-2] for k in range(2)]
+    np.testing.assert_allclose(
+        np.concatenate(projector.follow(projector.join(signal))), np.concatenate(expected), rtol=1e-7
+    )
 
 
 def test_columns_that_are_pressed_below_zero_stay_there(rng):
