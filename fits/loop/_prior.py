@@ -85,9 +85,9 @@ class Roughness(eqx.Module):
         xp, _ = _algebra(self.density, hyper.log_density)
         forms = jax.tree.leaves(self)
         uneven = sum(xp.exp(weight) * form for weight, form in zip(hyper.weights, forms, strict=True))
-        # What is even costs nothing, but no density of ten strokes is believed, as of relays at an end of the range
-        # that no run resets; and a great weight on the rest must not make it negative by rounding.
-        floor = 1 / 10.0**2 + _ROUNDING * xp.max(xp.diagonal(uneven))
+        # What is even costs nothing, but no density of 100 strokes is believed; and a great weight on the rest
+        # must not make it negative by rounding.
+        floor = 1 / 100.0**2 + _ROUNDING * xp.max(xp.diagonal(uneven))
         return uneven + floor * xp.eye(uneven.shape[0])
 
     def project(self, basis: Float[Array | np.ndarray, "D d"]) -> "Roughness":
