@@ -232,7 +232,7 @@ def test_lines_are_kept_where_a_lag_or_an_effect_leaves_less_than_any_beside_ste
     assert PlainFit.outdoes(fit, Other(("zero",), left[1], steps_best, steps_lag)) == lines
 
 
-def fitted_to(holds, left, best_z, aside=(), missed_um2=1.0, late=0.0):
+def fitted_to(holds, left, best_z, aside=(), missed_um2=1.0, late=0.0, late_s=0.0):
     """A fit that leaves so many noise variances in each sample, its best effect, and how runs held out go."""
     baseline = SimpleNamespace(aside=[SimpleNamespace(hold=hold) for hold in aside])
     fit = SimpleNamespace(
@@ -244,7 +244,10 @@ def fitted_to(holds, left, best_z, aside=(), missed_um2=1.0, late=0.0):
         missed_um2=missed_um2,
         delay_drop=lambda _: late,
         in_noise_of=lambda _: fit,
+        late=lambda: (late, late_s),
+        scales=SimpleNamespace(interval_s=1.0),
     )
+    fit.is_half_a_sample_late = PlainFit.is_half_a_sample_late.fget(fit)
     fit.foretold_in_steps = PlainFit.foretold_in_steps.fget(fit)
     return fit
 
@@ -278,6 +281,11 @@ def test_steps_are_taken_that_leave_less_beside_the_best_effect_or_predict_bette
     assert not PlainFit.explains_more(fitted_to(("zero",), 7.0, 190.0, missed_um2=1.1), lines)
     # Of noise alone nothing would leave less.
     assert not PlainFit.explains_more(fitted_to(("zero",), 1.0, 10.0), fitted_to(("first",), 5.0, 199.0))
+    # Much is left either way, and what explains most of it beside lines is a delay of half a sample, or of more.
+    steps = fitted_to(("zero",), 5.05, 93.0, missed_um2=0.5)
+    for late_s, taken in ((0.4, True), (0.7, False), (0.1, False)):
+        late = fitted_to(("first",), 5.0, 100.0, late=9_900.0, late_s=late_s)
+        assert PlainFit.explains_more(steps, late) == taken
 
 
 def replace_aside(fit):

@@ -14,20 +14,18 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._refit import nothing, refit, refit_beside
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._residual_tests import period_of, repeats_in
-from fits.diagnosis._score import Probe, Scored, applicable, law_of, probes_of, scales_of, score
+from fits.diagnosis._score import Probe, Scored, law_of, probe_all, probes_of, scales_of, score
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
-from fits.io._threads import map_in_threads
 from fits.stage._run import residual_of
 from microid import Hold
 from microid.effects import EFFECTS, AbstractEffect, Scales
 
 Holds = tuple[Hold, ...]
-# Why an effect was not asked about.
-_NO_SAMPLES = "nothing of it was found, sample by sample"
-_TOO_PLAIN = "the runs are too short or too plain to show it"
 IN_LINES: Holds = ("first",)
 IN_STEPS: Holds = ("zero",)
 _HOLDS: Holds = "first", "smooth", "zero"
+# Halves of a sample by which readings are late of a command that is held between samples.
+_LEAST, _MOST = 0.5, 1.2
 # What is left exceeds noise by no more than this part of it.
 _NOISE = 0.05
 # So many effects are fitted beside a way of the command, which one explains that leaves half of what others do.
@@ -66,7 +64,7 @@ class PlainFit:
     @cached_property
     def probed(self) -> tuple[list[Probe], list[tuple[str, str]]]:
         """Probes of every effect that can be asked about, and why the others cannot be."""
-        return _probed(self.bench, self.scales, self.projector)
+        return probe_all(self.bench, self.scales, self.projector)
 
     @cached_property
     def left(self) -> np.ndarray:
@@ -217,6 +215,13 @@ class PlainFit:
         aside = {run.hold for run in self.regression.baseline.aside}
         return "zero" in aside and "zero" not in self.holds
 
+    @property
+    def is_half_a_sample_late(self) -> bool:
+        """Whether nothing explains more than a delay of half a sample, of which the poles may have taken some."""
+        drop, late_s = self.late()
+        halves = 2 * late_s / self.scales.interval_s
+        return drop > (1 - self.thresholds.model_error) * self.largest_z() ** 2 and _LEAST < halves < _MOST
+
     @cached_property
     def missed_um2(self) -> float:
         """Sum of squares by which all that is held out is missed."""
@@ -227,8 +232,8 @@ class PlainFit:
     def explains_more(self, other: "PlainFit") -> bool:
         """Whether less is left beside the best effect than another fit leaves, and nothing is predicted worse.
 
-        Where runs held out go as here, and not as those of the other, it is enough that about as much is left, and
-        that they are predicted better.
+        It is enough that about as much is left, and that what is held out is predicted better, where runs held out go
+        as here, and not as those of the other, or nothing explains more there than a delay of half a sample.
         """
         here = self.in_noise_of(other)
         noise, off = len(here.left), self.thresholds.model_error
@@ -240,7 +245,8 @@ class PlainFit:
             self.thresholds.other_hold_z**2, off * (there - noise)
         ):
             return True
-        return other.foretold_in_steps and rest < (1 + off) * there and self.missed_um2 < (1 - off) * other.missed_um2
+        predicts = rest < (1 + off) * there and self.missed_um2 < (1 - off) * other.missed_um2
+        return predicts and (other.foretold_in_steps or other.is_half_a_sample_late)
 
     def leaves_less(self, other: "PlainFit") -> bool:
         """Whether less is left here than another fit leaves."""
@@ -334,17 +340,3 @@ def _climbed(worth: Callable[[Holds], float], holds: Holds, among: Holds = _HOLD
         if worth(best) <= worth(holds):
             return holds
         holds = best
-
-
-def _probed(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
-    """Simulate every probe of every effect that can be asked about, and say of the others why not."""
-
-    def ask(form: type[AbstractEffect]) -> tuple[list[Probe], str | None]:
-        reason = applicable(bench.baseline, form)
-        found = [] if reason else list(probes_of(bench, form, scales, projector))
-        unseen = _NO_SAMPLES if form.statistic else _TOO_PLAIN
-        return found, reason or (None if found else unseen)
-
-    each = map_in_threads(ask, EFFECTS)
-    skipped = [(form.name, reason) for form, (_, reason) in zip(EFFECTS, each, strict=True) if reason is not None]
-    return [probe for found, _ in each for probe in found], skipped

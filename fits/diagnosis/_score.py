@@ -11,13 +11,17 @@ from fits.diagnosis._baseline import Baseline
 from fits.diagnosis._effects import Bench, Law, times, without_host
 from fits.diagnosis._orthonormal import take_off
 from fits.diagnosis._projector import Projector
+from fits.io._threads import map_in_threads
 from fits.io.columns import columns_beside
 from fits.stage._encode import spec_of
 from fits.stats._score_test import best_multiples, evidence, evidence_of, robust_z, squares
 from microid import Coordinates
-from microid.effects import AbstractEffect, Scales, host
+from microid.effects import EFFECTS, AbstractEffect, Scales, host
 
 _DRAWS = 2000
+# Why an effect was not asked about.
+_NO_SAMPLES = "nothing of it was found, sample by sample"
+_TOO_PLAIN = "the runs are too short or too plain to show it"
 # Share of a signature that must be left for the records to show it at all.
 _BLIND = 0.003
 
@@ -127,6 +131,20 @@ def probes_of(
                 columns.append(tuple(change))
         if all(np.all(np.isfinite(c)) for column in columns for c in column):
             yield Probe(tuple(group), tuple(columns), one_sided(form))
+
+
+def probe_all(bench: Bench, scales: Scales, projector: Projector) -> tuple[list[Probe], list[tuple[str, str]]]:
+    """Simulate every probe of every effect that can be asked about, and say of the others why not."""
+
+    def ask(form: type[AbstractEffect]) -> tuple[list[Probe], str | None]:
+        reason = applicable(bench.baseline, form)
+        found = [] if reason else list(probes_of(bench, form, scales, projector))
+        unseen = _NO_SAMPLES if form.statistic else _TOO_PLAIN
+        return found, reason or (None if found else unseen)
+
+    each = map_in_threads(ask, EFFECTS)
+    skipped = [(form.name, reason) for form, (_, reason) in zip(EFFECTS, each, strict=True) if reason is not None]
+    return [probe for found, _ in each for probe in found], skipped
 
 
 def _is_allowed(effect: AbstractEffect) -> bool:
