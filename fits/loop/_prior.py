@@ -270,7 +270,7 @@ class Evidence:
         """Cholesky factors of the precision, and of parts of the prior's, see `Roughness.precision`; lower ones."""
         weights = np.exp(np.delete(logs, 4))
         prior = (weights @ self._forms).reshape(self._size, self._size)
-        prior[np.diag_indices(self._size)] += 1 / 10.0**2 + _ROUNDING * np.max(weights @ self._diagonals)
+        prior[np.diag_indices(self._size)] += 1 / 100.0**2 + _ROUNDING * np.max(weights @ self._diagonals)
         parts = [cholesky(prior[part, part]) for part in self._parts]
         return cholesky(self._moments.gram / np.exp(logs[4]) + prior), parts
 
