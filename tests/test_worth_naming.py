@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_diagnosis_decisions import misfit
+from test_diagnosis_residuals import faults
 
 from fits import Record
 from fits.diagnosis import _misfit
@@ -159,3 +160,28 @@ def test_hums_that_each_run_has_of_its_own_are_in_every_run():
     assert not Refit.in_each_run(strengths(2.0, False), [0], 0.3, 4.0)
     # What a run does not show may be as large as in the other.
     assert Refit.in_each_run(strengths(2.0, False), [0], 0.3, 8.0)
+
+
+def test_bad_samples_that_show_beside_the_causes_are_taken_out_of_the_readings(monkeypatch):
+    """A large effect hides the smaller ones before it is known."""
+    index = np.arange(2000)
+    first, later = index % 500 == 7, index % 400 == 11
+    known = faults(spikes=(first,), heights_um=(2.0 * first,))
+    seen = faults(spikes=(later,), heights_um=(0.3 * later,), quantum_um=0.0)
+    monkeypatch.setattr(_misfit, "find_faults", lambda *_: seen)
+    monkeypatch.setattr(_misfit, "_anew", lambda _, first, now: SimpleNamespace(first=first, projector=now))
+    projector = SimpleNamespace(regression=None, roughness=(), with_readings_less=lambda heights_um: heights_um)
+    ready = SimpleNamespace(faults=known, reading=SimpleNamespace(thresholds=Thresholds()))
+    model = SimpleNamespace(change_um=())
+    found = SimpleNamespace(causes=("creep",), first=projector, projector=projector, model=model)
+    after, beside, unnamed = _misfit.faults_beside(ready, found)
+    assert beside.count == first.sum() + later.sum()
+    np.testing.assert_array_equal(beside.heights_um[0], 2.0 * first + 0.3 * later)
+    # Those that were known are not in the readings any more.
+    np.testing.assert_array_equal(after.projector[0], 0.3 * later)
+    assert unnamed is known
+    # Where nothing was found, they are as they were.
+    found.causes = ()
+    after, beside, unnamed = _misfit.faults_beside(ready, found)
+    assert after is found
+    assert beside.count == unnamed.count == first.sum()
