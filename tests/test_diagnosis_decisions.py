@@ -207,8 +207,14 @@ def asked(monkeypatch):
         parts = {"bench": None, "regression": None, "probes": (), "faults": None, "skipped": ()}
         return Prepared(reading, baseline, projector=None, **parts)
 
-    def conclude(ready, *_):
-        answer = log.answers[len(log.readings) - 1]
+    def select(*_):
+        number = len(log.readings) - 1
+        left_um = log.answers[number].get("left", 1.0 - 0.1 * number)
+        place = {"plain_instead": lambda _: log.places.pop(0) if log.places else None}
+        return SimpleNamespace(number=number, left_um=left_um, **place)
+
+    def conclude(ready, found, *_):
+        answer = log.answers[found.number]
         # Root mean squares of the errors in what was held out, in um, beside noise of 1 um.
         after_um = answer.get("error", 1.0)
         gain = Gain(answer.get("plain", after_um), after_um, noise_um=1.0)
@@ -216,8 +222,7 @@ def asked(monkeypatch):
         return Answer("effect_found" if causes else "no_effect", causes, gain, answer, ready.baseline.remarks)
 
     monkeypatch.setattr(_diagnose, "prepare_diagnosis", prepare)
-    found = SimpleNamespace(plain_instead=lambda _: log.places.pop(0) if log.places else None)
-    monkeypatch.setattr(_diagnose, "select", lambda *_: found)
+    monkeypatch.setattr(_diagnose, "select", select)
     monkeypatch.setattr(_diagnose, "look_again", lambda *_: log.second)
     monkeypatch.setattr(_diagnose, "is_better", lambda *_: log.better)
     monkeypatch.setattr(_diagnose, "conclude", conclude)
@@ -246,6 +251,9 @@ def test_a_plain_stage_that_was_found_beside_an_effect_of_none_is_gone_on_from(a
     _, kept, (first, again) = asked({}, {"z": (9.0,)}, places=["there"])
     assert kept == {"z": (9.0,)}
     assert first is again
+    # A fit from there that leaves more has not found back.
+    _, kept, _ = asked({"z": (5.0,)}, {"z": (9.0,), "left": 10.0}, places=["there"])
+    assert kept["z"] == (5.0,)
 
 
 @pytest.mark.parametrize("better", [True, False])

@@ -216,6 +216,7 @@ def test_lines_are_kept_where_a_lag_leaves_less_beside_them_than_beside_curves(l
         (15_000.0, 30_000.0, 2.6, 14_000.0, 9_900.0, False),
         # Steps leave noise without any.
         (9_000.0, 30_000.0, 1.0, 10_000.0, 10_000.0, False),
+        (9_700.0, 30_000.0, 1.07, 10_700.0, 10_700.0, True),
     ],
 )
 def test_lines_are_kept_where_a_lag_or_an_effect_leaves_less_than_any_beside_steps(
@@ -228,8 +229,12 @@ def test_lines_are_kept_where_a_lag_or_an_effect_leaves_less_than_any_beside_ste
         left_beside_best=best,
         largest_z=lambda: 80.0,
         thresholds=THRESHOLDS,
+        is_rounded=False,
     )
     assert PlainFit.outdoes(fit, Other(("zero",), left[1], steps_best, steps_lag)) == lines
+    # Errors of rounding look like a little more than noise.
+    fit.is_rounded = True
+    assert PlainFit.outdoes(fit, Other(("zero",), left[1], steps_best, steps_lag)) == (lines and steps > 1.09)
 
 
 def fitted_to(holds, left, best_z, aside=(), missed_um2=1.0, late=0.0, late_s=0.0):

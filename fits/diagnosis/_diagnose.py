@@ -159,7 +159,9 @@ def diagnose(
         ready, found = selected(reading)
         if (better := found.plain_instead(thresholds)) is not None and has_time():
             progress("fitting the plain stage again, from where it has gone beside an effect that explains little")
-            ready, found = selected(reading, better)
+            there, other = selected(reading, better)
+            # From far away it may not have found back.
+            ready, found = (there, other) if other.left_um < found.left_um else (ready, found)
         elif (again := look_again(ready, found, progress, before(_PREPARED))) is not None:
             plain, beside = again
             other = chosen(beside)

@@ -62,6 +62,11 @@ class Selection:
     explained: float = 0.0
     finest: bool = False
 
+    @property
+    def left_um(self) -> float:
+        """What the plain stage leaves, root mean square."""
+        return self.first.unit_um(self.plain.residual) * (self.plain.cost / self.first.count) ** 0.5
+
     def plain_instead(self, thresholds: Thresholds) -> Problem | None:
         """Where the plain stage is, if it has gone there beside effects that explain little at that place."""
         baseline = self.projector.regression.baseline

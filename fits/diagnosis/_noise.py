@@ -44,6 +44,10 @@ class Faults:
     band: Band
     remarks: tuple[str, ...] = ()
 
+    def is_rounded(self, thresholds: Thresholds) -> bool:
+        """Whether rounding is more than a minor part of the noise."""
+        return self.quantum_um**2 / 12 > thresholds.minor_share * float(np.mean([n.total_um**2 for n in self.noise]))
+
     @property
     def count(self) -> int:
         """Number of spikes."""

@@ -47,6 +47,11 @@ class PlainFit:
         """How the command of each run is taken to go between samples."""
         return tuple(run.hold for run in self.regression.baseline.runs)
 
+    @property
+    def is_rounded(self) -> bool:
+        """Whether rounding is more than a minor part of the noise."""
+        return self.faults.is_rounded(self.thresholds)
+
     @cached_property
     def projector(self) -> Projector:
         return Projector(self.regression, self.faults.noise).bounded()
@@ -301,8 +306,9 @@ class PlainFit:
         there = other.in_noise_of(self)
         whole, here, noise = (float(there.left @ there.left), float(self.left @ self.left), len(there.left))
         if "zero" in other.holds:
-            # What does not count as unexplained is noise, of which nothing would leave less.
-            if whole <= (1 + self.thresholds.rest_noise**2) * noise:
+            # Of noise alone nothing would leave less; of rounding, whose errors are not independent, by a little.
+            slack = self.thresholds.rest_noise**2 if self.is_rounded else _NOISE
+            if whole <= (1 + slack) * noise:
                 return False
             lines, steps = (min(one.left_beside_best, one.left_beside_lag()) for one in (self, there))
             return lines < steps - max(self.thresholds.other_hold_z**2, _PLAIN * (steps - noise))
