@@ -65,7 +65,7 @@ def conclude(
     noise_um = float(np.sqrt(np.mean([n.total_um**2 for n in beside.noise])))
     # Rounding repeats itself with the position and comes in bursts; it is a cause of its own.
     rounding_um = ready.faults.quantum_um / 12**0.5
-    rounded = rounding_um**2 > thresholds.minor_share * noise_um**2
+    rounded = beside.is_rounded(thresholds)
     # A floor's vibration is noise, however slow it is: what moves along with it by chance is no misfit.
     itself = beside.band.alone or beside.rings_itself(baseline.resonance_Hz, thresholds)
     shaken = beside.is_narrow(thresholds) and (bool(found.causes) or not itself)

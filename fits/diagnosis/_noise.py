@@ -27,9 +27,9 @@ class Faults:
     """What is wrong with samples, and what the noise of each run is, learnt from `source`, in words.
 
     Bad samples of each run are `spikes`, and `heights_um` how far off they are, shape `(n,)`; `repeats_um` is how far
-    those were off that were lost, shape `(lost,)`. `quantum_um` is the
-    last digit of the sensor, the largest of all runs, 0 for none; `jitter_um` what the jitter of the instants of
-    sampling makes in the readings; `band` the strongest narrow band of all runs.
+    those were off that were lost, shape `(lost,)`. `quantum_um` is the last digit of the sensor, the largest of all
+    runs, 0 for none; `jitter_um` what the jitter of the instants of sampling makes in the readings; `band` the
+    strongest narrow band of all runs.
     """
 
     noise: tuple[Noise, ...]
