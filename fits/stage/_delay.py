@@ -12,6 +12,7 @@ from fits.loop._design import columns_of
 from fits.loop._misfit import Misfit, outlying
 from fits.loop._result import FitResult
 from fits.loop._run import Run
+from fits.stage._checks import BESIDE_A_LAG
 from fits.stage._columns import pieces
 from fits.stage._moments import along, linearise
 from fits.stage._plan import Plan
@@ -36,7 +37,7 @@ _HELD = (
 )
 # In samples, where it looks like that.
 _ABOUT_HALF = 0.3, 0.75
-REMEDY = "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
+_SHIFT = "check which columns and time stamps belong together, shift the displacement by as many lines, and fit again"
 
 
 @dataclass(frozen=True)
@@ -127,13 +128,18 @@ class WithoutDelays:
         low, high = _ABOUT_HALF
         return _HELD if all(low < one.samples < high for one in self.delays) else None
 
+    @property
+    def advice(self) -> str:
+        """What to do where no fit stands beside them; readings that lag come late, too."""
+        return (self.remedy or _SHIFT) + (BESIDE_A_LAG if max(one.delay_s for one in self.delays) > 0 else "")
+
     def widen(self, fit: FitResult[Stage]) -> FitResult[Stage]:
         """Name the delays, and widen intervals by what they did; a `DataError` if that leaves nothing to say."""
         other, said = Alternative.of(self.solved), self.words()
         for p, v in zip(fit.parameters, other.values, strict=True):
             if abs(v - p.value) > 0.5 * min(abs(v), abs(p.value)):
                 moved = f"{p.name} would come out as {p.value:.4g} instead of {v:.4g} {p.unit}"
-                raise DataError(f"{said}, and {moved}: {self.remedy or REMEDY}")
+                raise DataError(f"{said}, and {moved}: {self.advice}")
         usual = "check columns and time stamps, or the delay of the sensor's electronics"
         return other.widen(fit, said, self.remedy or usual)
 

@@ -20,8 +20,8 @@ from fits.loop._result import FitResult, FitStatus, RunReport
 from fits.loop._run import PAST_IS_ESTIMATED, Progress, Run
 from fits.stage._before import memory_before
 from fits.stage._began import prepare_asides
-from fits.stage._checks import BESIDE_A_LAG, check_gains, implausible, refuse_undersampled
-from fits.stage._delay import GROSS_PCT, REMEDY, Alternative, fit_without_delays, fit_without_outliers
+from fits.stage._checks import check_gains, implausible, refuse_undersampled
+from fits.stage._delay import GROSS_PCT, Alternative, fit_without_delays, fit_without_outliers
 from fits.stage._run import (
     residual_of,
     settled_samples,
@@ -88,8 +88,7 @@ def fit_stage(
     if undelayed is None or any(one.far for one in misfits(undelayed.solved.runs, undelayed.solved.residuals_um)):
         refuse_undersampled(solved.stage, runs, left)
     if undelayed is not None and (found.failure is not None or simplified):
-        beside = BESIDE_A_LAG if max(one.delay_s for one in undelayed.delays) > 0 else ""
-        raise DataError(f"{undelayed.words()}, and no fit was found with that: {undelayed.remedy or REMEDY}{beside}")
+        raise DataError(f"{undelayed.words()}, and no fit was found with that: {undelayed.advice}")
     if found.failure is not None:
         raise found.failure
     gross = worst(left)

@@ -216,10 +216,14 @@ def solve_chain(
                 step, columns, hyper, variance, distance = _step(
                     problem, total, columns_um, hyper, weights, damping, known
                 )
+                # From a far start a useless law, or a pole beyond all lines, would be lost at a bound.
+                most = np.maximum(1.0, 0.5 * np.abs(z))
                 if chain.grid is None:
-                    # A law that a far start makes useless would be lost at a bound.
-                    most = np.maximum(1.0, 0.5 * np.abs(z))
                     step = np.clip(step, -most, most)
+                elif np.any(np.abs(step) > most) and damping < _HIGHEST:
+                    # Its columns go with it, and are found again with a shorter one.
+                    damping *= _FACTOR
+                    continue
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
