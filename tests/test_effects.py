@@ -86,8 +86,9 @@ def examples(effect):
 
 def nothing(probe):
     """The same effect without any."""
-    far = {"slew_limit": 1e9, "driver_saturation": 1e6 * (1 if probe.form == "" else -1)}
-    names = probe.strength or tuple(n for n in ("limit_V_per_s", "rail_V") if hasattr(probe, n))
+    beyond = 1e6 * (1 if probe.form == "" else -1)
+    far = {"slew_limit": 1e9, "driver_saturation": beyond, "end_stop": beyond}
+    names = probe.strength or tuple(n for n in ("limit_V_per_s", "rail_V", "stop_um") if hasattr(probe, n))
     empty = [jnp.full_like(getattr(probe, name), 0.0 if probe.strength else far[probe.name]) for name in names]
     return eqx.tree_at(lambda e: [getattr(e, name) for name in names], probe, empty)
 

@@ -72,7 +72,7 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
 
 
 def test_the_library_and_what_is_outside_of_it():
-    assert len(ds.EFFECTS) == 31
+    assert len(ds.EFFECTS) == 32
     assert not set(ds.EFFECTS) & set(ds.OUTSIDE)
     assert {"wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
 

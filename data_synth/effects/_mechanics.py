@@ -68,6 +68,35 @@ def stiffness_hardening(mechanics: Mechanics, run: Situation, *, rise: float, ce
     )
 
 
+class _Stop:
+    """A spring of `stiffness` times the stage's, that only touches beyond `stop_um`."""
+
+    def __init__(self, stop_um: float, stiffness: float) -> None:
+        self._stop_um, self._stiffness = stop_um, stiffness
+
+    def rest(self, static_um: float) -> float:
+        beyond_um = max(static_um - self._stop_um, 0.0)
+        return static_um - beyond_um * self._stiffness / (1 + self._stiffness)
+
+    def force_um(self, displacement_um: float) -> float:
+        return self._stiffness * max(displacement_um - self._stop_um, 0.0)
+
+
+@effect(
+    "mechanics",
+    "stiffness",
+    usual=1.0,
+    limit=30.0,
+    draws={"stop_share": (0.9, 0.995)},
+    needs="mass",
+    between={"stop_share": POSITIVE},
+)
+def end_stop(mechanics: Mechanics, run: Situation, *, stiffness: float, stop_share: float = 0.95) -> Mechanics:
+    """A spring of `stiffness` times the stage's own touches it beyond `stop_share` of the stroke."""
+    stop_um = stop_share * run.rig.stroke_um
+    return replace(mechanics, resistances=(*mechanics.resistances, lambda: _Stop(stop_um, stiffness)))
+
+
 class _Dahl:
     """Friction that saturates at `most_um` (force over stiffness) within a few `length_um` of travel."""
 

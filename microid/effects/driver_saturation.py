@@ -41,7 +41,7 @@ class DriverSaturation(AbstractEffect):
     fingerprint: ClassVar[str] = (
         "The displacement is flat beyond a level of the command, and after it as though it had turned at that level."
     )
-    confusions: ClassVar[tuple[str, ...]] = ("sensor_nonlinearity", "slew_limit", "backlash")
+    confusions: ClassVar[tuple[str, ...]] = ("sensor_nonlinearity", "slew_limit", "backlash", "end_stop")
     experiment: ClassVar[str] = "Two peaks of different height beyond the level, each held."
     source: ClassVar[str] = "rails at 95 to 103 % of the nominal range under load (estimate)"
     column: ClassVar[str] = "drive_monitor_V"
