@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from fits.diagnosis._noise import _bands, _one_floor
 from fits.diagnosis._thresholds import THRESHOLDS
-from fits.stats._band import Band, band_of
+from fits.stats._band import Band, band_of, line_in
 
 # Residuals over a time, some with white noise of standard deviation one.
 ODD = {
@@ -113,3 +113,32 @@ def test_a_band_of_one_run_that_another_would_show_is_not_the_floors(rng):
     floor = ringing(rng, 26.0, 15.0, 2 * n, rate_Hz)
     parts = [(part + own, *settings) for part, own in zip(np.split(floor, 2), quiet, strict=True)]
     assert not found(*parts)
+
+
+def test_a_line_is_followed_by_its_phase_and_noise_of_a_band_is_not(rng):
+    n, rate_Hz = 6000, 3000.0
+    time_s, middle_Hz = np.arange(n) / rate_Hz, rng.uniform(230, 280)
+    used = (np.arange(n) < 2500) | (np.arange(n) > 2900)
+    line = 0.05 * np.sin(2 * np.pi * middle_Hz * time_s + rng.uniform(0, 6))
+    white = 0.006 * rng.standard_normal(n)
+    band = band_of(line + white, 1 / rate_Hz, time_s)
+    assert band.is_line
+    frequency_Hz, found = line_in(line + white, 1 / rate_Hz, used, band)
+    # The phase of both quadratures is known to 0.006 / 0.05 * sqrt(2 / n) or 2e-3, and five times that at an end.
+    assert frequency_Hz == pytest.approx(middle_Hz, abs=0.02)
+    np.testing.assert_allclose(found, line, atol=2.5e-3)
+    # Noise of a quality of 40 forgets its phase within some cycles.
+    radius = np.exp(-np.pi * middle_Hz / 40 / rate_Hz)
+    past = [1.0, -2 * radius * np.cos(2 * np.pi * middle_Hz / rate_Hz), radius**2]
+    wave = lfilter([1.0], past, rng.standard_normal(n + 5000))[5000:]
+    wave = 0.05 * wave / np.std(wave) + white
+    assert line_in(wave, 1 / rate_Hz, used, replace(band_of(wave, 1 / rate_Hz, time_s), bins=1)) is None
+
+
+def test_a_line_above_all_mains_is_a_band(rng):
+    time_s = np.arange(6000) / 3000.0
+    residual = 0.01 * np.sin(2 * np.pi * 417.0 * time_s) + 0.006 * rng.standard_normal(6000)
+    found = band_of(residual, 1 / 3000.0, time_s)
+    assert found.z > 8
+    assert found.frequency_Hz == pytest.approx(417.0, rel=0.01)
+    assert not found.mains

@@ -86,11 +86,11 @@ def faults_beside(ready: Prepared, found: Selection) -> tuple[Selection, Faults,
     faults = find_faults(projector.regression, found.model.change_um, thresholds, projector.roughness)
     if not found.causes:
         # What a density explains that is rougher than its grid is no band.
-        quiet = replace(before, band=faults.band)
+        quiet = before if before.lines_um else replace(before, band=faults.band)
         return found, quiet, quiet
     beside = faults.beside(before)
-    if beside.count > before.count:
-        found = _anew(found, *(p.with_readings_less(faults.heights_um) for p in (found.first, found.projector)))
+    if beside.count > before.count or faults.lines_um:
+        found = _anew(found, *(p.with_readings_less(faults.wrong_um) for p in (found.first, found.projector)))
     return found, beside, before
 
 

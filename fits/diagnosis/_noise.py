@@ -10,7 +10,7 @@ from fits.diagnosis._projector import Projector
 from fits.diagnosis._regression import Regression
 from fits.diagnosis._thresholds import THRESHOLDS, Thresholds
 from fits.io._record import Record
-from fits.stats._band import Band, band_of, may_hold
+from fits.stats._band import Band, band_of, line_in, may_hold
 from fits.stats._cycles import cycles, without_cycles
 from fits.stats._noise import Noise, quantum_um, rough_noise_um
 from fits.stats._sensor_noise import floor_of, jitter_s, pooled, spikes, white_noise
@@ -27,7 +27,8 @@ class Faults:
     """What is wrong with samples, and what the noise of each run is, learnt from `source`, in words.
 
     Bad samples of each run are `spikes`, and `heights_um` how far off they are, shape `(n,)`; `repeats_um` is how far
-    those were off that were lost, shape `(lost,)`. `quantum_um` is the last digit of the sensor, the largest of all
+    those were off that were lost, shape `(lost,)`. `lines_um` are sines in the readings, which make the band, shape
+    `(n,)`, none where it is no line. `quantum_um` is the last digit of the sensor, the largest of all
     runs, 0 for none; `jitter_um` what the jitter of the instants of sampling makes in the readings; `band` the
     strongest narrow band of all runs.
     """
@@ -42,7 +43,7 @@ class Faults:
     jitter_um: float
     jitter_z: float
     band: Band
-    remarks: tuple[str, ...] = ()
+    lines_um: tuple[np.ndarray, ...] = ()
 
     def is_rounded(self, thresholds: Thresholds) -> bool:
         """Whether rounding is more than a minor part of the noise."""
@@ -55,13 +56,22 @@ class Faults:
 
     @property
     def repaired(self) -> bool:
-        """Whether there are enough spikes to be taken out."""
-        return self.count >= _FEWEST_SPIKES
+        """Whether there are lines, or enough spikes, to be taken out."""
+        return self.count >= _FEWEST_SPIKES or bool(self.lines_um)
+
+    @property
+    def wrong_um(self) -> tuple[np.ndarray, ...]:
+        """How far off the readings of each run are by spikes and lines, shape `(n,)`."""
+        return tuple(map(np.add, self.heights_um, self.lines_um)) if self.lines_um else self.heights_um
 
     def beside(self, others: "Faults") -> "Faults":
-        """The same with the spikes of others, without which these were found."""
+        """The same with the spikes and lines of others, without which these were found."""
         spikes = tuple(map(np.logical_or, self.spikes, others.spikes))
-        return replace(self, spikes=spikes, heights_um=tuple(map(np.add, self.heights_um, others.heights_um)))
+        both = replace(self, spikes=spikes, heights_um=tuple(map(np.add, self.heights_um, others.heights_um)))
+        if not others.lines_um:
+            return both
+        lines = tuple(map(np.add, self.lines_um, others.lines_um)) if self.lines_um else others.lines_um
+        return replace(both, lines_um=lines, band=max(self.band, others.band, key=lambda band: band.size_um))
 
     def is_narrow(self, thresholds: Thresholds) -> bool:
         """Whether there is a narrow band beyond chance that is no hum."""
@@ -82,12 +92,12 @@ class Faults:
         return abs(self.band.frequency_Hz - resonance_Hz) < thresholds.apart_z * width_Hz
 
     def clean(self, records: Sequence[Record]) -> list[Record]:
-        """Take the spikes out of records."""
+        """Take the spikes and lines out of records."""
         if not self.repaired:
             return list(records)
         return [
-            replace(record, displacement_um=np.asarray(record.displacement_um) - height)
-            for record, height in zip(records, self.heights_um, strict=True)
+            replace(record, displacement_um=np.asarray(record.displacement_um) - wrong_um)
+            for record, wrong_um in zip(records, self.wrong_um, strict=True)
         ]
 
 
@@ -165,10 +175,34 @@ def find_faults(
     elif not all(floor.idle for floor in floors):
         source += ", as if it were white"
     size = size if z > thresholds.strong_z else 0.0
+    band, lines = _with_lines(band, fast, [run.fitted for run in baseline.runs], shaken, thresholds)
     made = size * float(np.sqrt(np.mean(np.concatenate([rate for _, _, rate, _ in jitters]) ** 2)))
     return Faults(
-        tuple(noise), source, tuple(found), tuple(heights), np.concatenate(repeats), quantum, size, made, z, band
+        *(tuple(noise), source, tuple(found), tuple(heights), np.concatenate(repeats), quantum, size, made, z),
+        *(band, lines),
     )
+
+
+def _with_lines(
+    band: Band,
+    left_um: Sequence[np.ndarray],
+    used: Sequence[np.ndarray],
+    shaken: Sequence[tuple[np.ndarray, float, np.ndarray]],
+    thresholds: Thresholds,
+) -> tuple[Band, tuple[np.ndarray, ...]]:
+    """A band, and the sines in what is left of the runs that make it, shape `(n,)`; none unless all runs have one."""
+    if not (band.z > thresholds.strong_z and band.is_line and not band.mains and not band.played and not band.alone):
+        return band, ()
+    each = [line_in(left, one[1], own, band) for left, own, one in zip(left_um, used, shaken, strict=True)]
+    found = [one for one in each if one is not None]
+    if len(found) < len(each):
+        return band, ()
+    lines = tuple(line for _, line in found)
+    middle_Hz = float(np.mean([frequency_Hz for frequency_Hz, _ in found]))
+    size_um = float(np.sqrt(np.mean([np.mean(line**2) for line in lines])))
+    rest_um = [float(np.std((left - line)[own])) for left, own, line in zip(left_um, used, lines, strict=True)]
+    samples = sum(int(own.sum()) for own in used)
+    return replace(band, frequency_Hz=middle_Hz, size_um=size_um, sd_um=max(rest_um) / samples**0.5), lines
 
 
 def _repeats_um(record: Record) -> np.ndarray:

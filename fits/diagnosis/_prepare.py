@@ -145,13 +145,13 @@ def fit_plain_stage(
     faults = find_faults(regression, None, reading.thresholds)
     if not faults.repaired:
         return PlainFit(regression, faults, reading.thresholds)
-    progress("fitting the plain stage again, without single bad samples")
+    progress("fitting the plain stage again, without bad samples")
     # Where an effect passes for bad samples, what runs show no poles of they show none of without these.
     left_out = () if regression.baseline.dynamic else regression.baseline.remarks
     for _ in range(_CLEANED):
         regression = regress(fit_baseline(faults.clean(records), *settings, regression.baseline.problem, left_out))
         known, faults = faults, find_faults(regression, None, reading.thresholds).beside(faults)
-        if faults.count == known.count:
+        if faults.count == known.count and faults.lines_um is known.lines_um:
             break
     return PlainFit(regression, faults, reading.thresholds)
 

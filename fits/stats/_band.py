@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 from scipy.ndimage import median_filter
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from fits.io._quantity import FloatArray
 from fits.stats._noise import repeated_square
 from fits.stats._noise_spectrum import DRIFT, MAINS_Hz
 
 # Where a band is looked for, in Hz, and from how many cycles in the record on.
-_LOWEST_Hz, _HIGHEST_Hz, _CYCLES = 2.0, 200.0, 5
+_LOWEST_Hz, _HIGHEST_Hz, _CYCLES = 2.0, 1000.0, 5
 # A band is told from what is around it in so many bins at least.
 _FEWEST = 20
 # Bins of the spectrum are averaged over this part of their frequency. A Hann window leaves half of them independent.
@@ -69,6 +69,11 @@ class Band:
             for k in range(1, 5)
         )
 
+    @property
+    def is_line(self) -> bool:
+        """Whether it is no wider than a line is in so long a record."""
+        return self.rate_Hz > 0 and self.bins <= _LINE
+
     def agrees(self, other: "Band") -> bool:
         """Whether another is within the half of their widths."""
         halves_Hz = (one.frequency_Hz / max(one.quality, 1.0) / 2 for one in (self, other))
@@ -76,7 +81,7 @@ class Band:
 
 
 def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -> Band:
-    """Find a narrow band between 2 and 200 Hz that goes on throughout, and say whether the command may play it.
+    """Find a narrow band between 2 and 1000 Hz that goes on throughout, and say whether the command may play it.
 
     Residual and command are evenly sampled, shape `(n,)`. Where the samples show too few frequencies of that range,
     nothing is found, with an evidence of 0.
@@ -127,6 +132,35 @@ def band_of(residual_um: FloatArray, interval_s: float, command_V: FloatArray) -
     sd_um = size_um / (2 * max(width_Hz * n * interval_s, 1.0) ** 0.5)
     z = max(2 * (found - nothing - np.log(inside.sum())), 0.0) ** 0.5
     return Band(middle_Hz, size_um, sd_um, quality, float(z), 1 / interval_s, bins, played)
+
+
+def line_in(
+    residual_um: FloatArray, interval_s: float, used: np.ndarray, band: Band
+) -> tuple[float, FloatArray] | None:
+    """The sine throughout an evenly sampled residual that makes a band: its frequency in Hz, and itself, `(n,)`.
+
+    Its phase is that of the samples that are `used`, shape `(n,)`. None where most of the band is no such sine.
+    """
+    n = len(residual_um)
+    bin_Hz, turns = 1 / (n * interval_s), 2j * np.pi * interval_s * np.arange(n)
+    left = np.where(used, residual_um - residual_um[used].mean(), 0.0)
+
+    def swing(frequency_Hz: float) -> FloatArray:
+        columns = np.exp(turns * frequency_Hz)
+        both = np.stack([columns.real, columns.imag], axis=1)
+        return np.asarray(both @ np.linalg.lstsq(both[used], left[used], rcond=None)[0])
+
+    def rest(frequency_Hz: float) -> float:
+        return float(np.sum((left - swing(frequency_Hz))[used] ** 2))
+
+    middle_Hz = min(band.frequency_Hz + bin_Hz * np.arange(-_LINE, _LINE + 1) / 2, key=rest)
+    within = middle_Hz - bin_Hz / 2, middle_Hz + bin_Hz / 2
+    found = minimize_scalar(rest, bounds=within, method="bounded", options={"xatol": 1e-4 * bin_Hz})
+    best_Hz = float(found.x)
+    wave = swing(best_Hz)
+    near = np.abs(np.fft.rfftfreq(n, interval_s) - middle_Hz) <= 2 * _LINE * bin_Hz
+    before, after = (float(_power(values)[near].sum()) for values in (left, left - np.where(used, wave, 0.0)))
+    return (best_Hz, wave) if after < (1 - _SHARE) * before else None
 
 
 def may_hold(band: Band, residual_um: FloatArray, interval_s: float, chance: float) -> bool:
