@@ -20,11 +20,10 @@ from fits.diagnosis._extension import (
     predicts_worse,
     without_effects,
 )
-from fits.diagnosis._findings import bounds, causes_of, with_held_gain
+from fits.diagnosis._findings import before_the_runs, bounds, causes_of, with_held_gain
 from fits.diagnosis._misfit import SHOWN, faults_beside, worth_naming
 from fits.diagnosis._noise import Faults, name_faults
 from fits.diagnosis._prepare import BEHIND, ONE_WAY, Prepared, of_half_a_sample, of_holds_aside
-from fits.diagnosis._refit import Refit
 from fits.diagnosis._residual_tests import explain, further_regressors, irregular, run_regressors
 from fits.diagnosis._result import Diagnosis, FoundCause, Gain, RunView, Step, Test, Verdict
 from fits.diagnosis._thresholds import Thresholds
@@ -39,6 +38,7 @@ _OWN_LAG = (
     "the plain stage has no dynamics, which these runs do not show apart: the lag may be that of the driver and of "
     "the mechanics, which every stage has"
 )
+_OF_NO_USE = "something else is left, and what was held out is predicted no better with what all runs have of that"
 # Part of the stroke below which a change of the feedforward is rounding.
 _MET = 1e-9
 
@@ -105,7 +105,12 @@ def conclude(
         plain = not others.effects or predicts_worse(others.compared[len(baseline.runs) :], 0.0, 0.0)
         extension = without_effects(ready, extension) if plain else others
         how = "the stage is left plain" if plain else "the extended stage is without"
-        if own:
+        if plain and left_over and not all(_is_of_each_run(cause.name) for cause in kept):
+            # What all runs would have in common is none of what there is.
+            remarks.append(not_named([cause.name for cause in kept], _OF_NO_USE))
+            model, kept = found.plain, ()
+            rest_noise, left_over = misfit.unnamed(weak or small)
+        elif own:
             remarks.append(f"{own}: not the same in the runs held out, so that {how}")
     remarks += of_holds_aside(baseline.stage.hold, [one.run for one in extension.compared[len(baseline.runs) :]])
     # Up to its own size rounding makes structure, too.
@@ -149,7 +154,7 @@ def conclude(
         remarks.append(_OWN_LAG)
     if not late:
         remarks = [one for one in remarks if one != BEHIND]
-    remarks += _before_the_runs(model, thresholds.chance_z)
+    remarks += before_the_runs(model, thresholds.chance_z)
     if (held := held_gain([run.record for run in baseline.runs])) is not None:
         causes = with_held_gain(held, causes)
         remarks.append(held.sentence)
@@ -255,20 +260,15 @@ def verdict_of(causes: Sequence[FoundCause], left_um: float, explained: bool) ->
     return "effect_found" if causes else "no_effect"
 
 
+def _is_of_each_run(name: str) -> bool:
+    """Whether an effect differs from run to run, so that those held out say nothing of it."""
+    return card_of(name).independent or card_of(name).per_run
+
+
 def not_named(suspects: Sequence[str], why: str) -> str:
     """Say which effects came nearest, and why they are not named."""
     none = "it is not named" if len(suspects) == 1 else "none of them is named"
     return f"{', '.join(suspects).replace('_', ' ')} came nearest to what is left, but {why}: {none}"
-
-
-def _before_the_runs(model: Refit, least_z: float) -> list[str]:
-    """Say of which causes only what moves before the runs left behind shows, and no strength in the runs."""
-    return [
-        f"{law.form.name.replace('_', ' ')}: what shows is what moves before the record have left behind; as the rig "
-        "moved in the record itself, it may have none"
-        for k, law in enumerate(model.laws)
-        if law.remembers and model.strength_z(k) < least_z
-    ]
 
 
 def _tests(ready: Prepared, found: Selection) -> tuple[Test, ...]:
@@ -329,7 +329,7 @@ def _remarks(ready: Prepared, records: Sequence[Record]) -> tuple[str, ...]:
     """What the user should know of the records and the fit."""
     baseline = ready.baseline
     said = [warning for record in records for warning in record.warnings]
-    said += [*baseline.remarks, *ready.faults.remarks]
+    said += baseline.remarks
     pasts = [
         run.record.source
         for run in baseline.runs

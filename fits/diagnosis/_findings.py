@@ -284,3 +284,13 @@ def bounds(found: Selection, ready: Prepared, left: Sequence[Scored], named: Col
     skipped = dict(ready.skipped).items()
     out += [Bound(name, np.nan, np.nan, np.nan, reason) for name, reason in skipped if name not in asked]
     return tuple(sorted(out, key=lambda bound: -bound.z if np.isfinite(bound.z) else 1e9))
+
+
+def before_the_runs(model: Refit, least_z: float) -> list[str]:
+    """Say of which causes only what moves before the runs left behind shows, and no strength in the runs."""
+    return [
+        f"{law.form.name.replace('_', ' ')}: what shows is what moves before the record have left behind; as the rig "
+        "moved in the record itself, it may have none"
+        for k, law in enumerate(model.laws)
+        if law.remembers and model.strength_z(k) < least_z
+    ]
