@@ -191,6 +191,13 @@ class Moments(eqx.Module):
         """Keep only combinations of columns."""
         return Moments(basis.T @ self.gram @ basis, basis.T @ self.cross_um, self.energy_um2, self.count)
 
+    def moved(self, which: np.ndarray, by: np.ndarray) -> "Moments":
+        """Move some unknowns, of these numbers, `(k,)`, by as much, and keep the others."""
+        gram, cross = np.asarray(self.gram), np.asarray(self.cross_um)
+        kept = np.setdiff1d(np.arange(len(cross)), which)
+        energy = np.asarray(self.energy_um2) - 2 * cross[which] @ by + by @ gram[np.ix_(which, which)] @ by
+        return Moments(gram[np.ix_(kept, kept)], cross[kept] - gram[np.ix_(kept, which)] @ by, energy, self.count)
+
     def reduced(self, size: int, answer: np.ndarray, follow: np.ndarray) -> "Moments":
         """Keep the first `size` unknowns, the others being best at `answer - follow @ first`, of the shape `(p,)`."""
         gram, cross = np.asarray(self.gram), np.asarray(self.cross_um)

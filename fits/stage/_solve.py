@@ -214,16 +214,8 @@ def solve_chain(
         while True:
             try:
                 step, columns, hyper, variance, distance = _step(
-                    problem, total, columns_um, hyper, weights, damping, known
+                    problem, total, z, columns_um, hyper, weights, damping, known
                 )
-                # From a far start a useless law, or a pole beyond all lines, would be lost at a bound.
-                most = np.maximum(1.0, 0.5 * np.abs(z))
-                if chain.grid is None:
-                    step = np.clip(step, -most, most)
-                elif np.any(np.abs(step) > most) and damping < _HIGHEST:
-                    # Its columns go with it, and are found again with a shorter one.
-                    damping *= _FACTOR
-                    continue
             except FitError:
                 # The columns of a step too far may be out of their solver's reach.
                 damping *= _FACTOR
@@ -309,6 +301,7 @@ def _residuals(chain: Chain, z: np.ndarray, columns_um: np.ndarray, runs: Sequen
 def _step(
     problem: Problem,
     total: Moments,
+    z: np.ndarray,
     columns_um: np.ndarray,
     hyper: Hyper | None,
     weighing: Weighing,
@@ -317,15 +310,27 @@ def _step(
 ) -> tuple[np.ndarray, np.ndarray, Hyper | None, float, float]:
     """Change of coordinates, columns, their smoothness, noise variance in um^2, and standard deviations moved."""
     chain, stroke_um = problem.chain, problem.stroke_um
-    columns, variance, prior = columns_um, weighing.least_um**2, None
+    columns, variance, prior, found = columns_um, weighing.least_um**2, None, hyper
     size = 0 if hyper is None else chain.size
-    reduced, step, follow = split_moments(total, size, damping)
+    held, step = np.zeros(len(z), dtype=bool), np.zeros(len(z))
+    # No linearisation is believed so far: poles would be beyond all lines, and laws lost at a bound.
+    most = np.maximum(1.0, 0.5 * np.abs(z))
+    while True:
+        beside = total.moved(size + np.flatnonzero(held), step[held])
+        reduced, answer, follow = split_moments(beside, size, damping)
+        if hyper is not None and chain.grid is not None:
+            # The smoothness of the round before may be that of what was not fitted then.
+            fresh = replace(Hyper.start(), log_variance=hyper.log_variance)
+            solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, fresh, known=known)
+            columns, found = np.asarray(solution.columns) * stroke_um, solution.hyper
+            answer = answer - follow @ columns
+        step[~held] = answer
+        beyond = np.abs(step) > most
+        if not np.any(beyond):
+            break
+        step, held = np.clip(step, -most, most), held | beyond
+    hyper = found
     if hyper is not None and chain.grid is not None:
-        # The smoothness of the round before may be that of what was not fitted then.
-        fresh = replace(Hyper.start(), log_variance=hyper.log_variance)
-        solution = solve_grid(Data(chain.grid, reduced, (), ()), stroke_um, fresh, known=known)
-        columns, hyper = np.asarray(solution.columns) * stroke_um, solution.hyper
-        step = step - follow @ columns
         variance = float(np.exp(hyper.log_variance)) * stroke_um**2
         if not variance > 1e-20 * stroke_um**2:  # all is rounding below
             # The search for the noise went astray.

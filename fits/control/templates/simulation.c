@@ -4,7 +4,7 @@
  * ${provenance}
  *
  * The linear parts are exact from step to step. The force of the hysteresis runs in a line over each step, and its end
- * is found by correcting a first guess: an error of second order in the step.
+ * is found along secants: an error of second order in the step.
  */
 #include "${name}.h"
 
@@ -12,7 +12,7 @@
 
 #define ORDER (${order})       /* states of the linear parts */
 #define STEPS ${NAME}_STEPS
-#define CORRECTIONS (2)        /* of the force at the end of a step */
+#define CORRECTIONS (4)        /* of the force at the end of a step */
 #define HALVINGS (128)         /* of the bracket around the displacement at rest */
 #define MASS_GAIN (${mass_gain})       /* um of the mass per um of force */
 #define AT_REST_um (${mass_offset_um}) /* displacement of the mass under no command and force */
@@ -127,19 +127,29 @@ double ${name}_step(${name}_state *state, double command_V)
         const double rise = to_V - state->command_V;
         const double level = AT_REST_um + (PER_V * to_V);
         double late = state->force_um;
-        ${name}_memory memory = state->memory;
+        ${name}_memory memory;
         double z[ORDER];
         double free_um;
+        double off = 0.0;
+        double ahead = 0.0;
         int k;
 
         for (k = 0; k < ORDER; k++) {
             z[k] = along(KEEP[k], state->z) + (COMMAND[k] * rise);
         }
         free_um = level + along(MASS, z);
-        for (k = 0; k < CORRECTIONS; k++) {
+        for (k = 0; k <= CORRECTIONS; k++) {
             const double there_um = (free_um + (along(MASS, FORCE) * (late - state->force_um))) - (MASS_GAIN * late);
             memory = state->memory;
-            late = -law_step(&memory, there_um) / MASS_GAIN;
+            {
+                const double more = (-law_step(&memory, there_um) / MASS_GAIN) - late;
+                /* Along the secant of the last two guesses. */
+                ahead = ((k > 0) && (more != off)) ? ((ahead * more) / (off - more)) : more;
+                off = more;
+            }
+            if (k < CORRECTIONS) {
+                late += ahead;
+            }
         }
         for (k = 0; k < ORDER; k++) {
             state->z[k] = z[k] + (FORCE[k] * (late - state->force_um));
