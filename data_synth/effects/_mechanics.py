@@ -89,7 +89,7 @@ class _Stop:
     limit=30.0,
     draws={"stop_share": (0.9, 0.995)},
     needs="mass",
-    between={"stiffness": (-1.0, math.inf), "stop_share": POSITIVE},
+    between={"stiffness": (-1.0, 100.0), "stop_share": POSITIVE},
 )
 def end_stop(mechanics: Mechanics, run: Situation, *, stiffness: float, stop_share: float = 0.95) -> Mechanics:
     """A spring of `stiffness` times the stage's own touches it beyond `stop_share` of the stroke."""
