@@ -1,4 +1,4 @@
-"""Aging and wake-up: the gain changes with the cycles that the piezo has gone through."""
+"""Aging and wake-up: the gain changes with the cycles that the piezo has gone through, or with the time."""
 
 from typing import Any, ClassVar, Self
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from microid._linear import Times
 from microid._param import _as_inexact, param
 from microid._part import AbstractPart, Signal
-from microid.effects._base import AbstractEffect, Place, Scales, View, register
+from microid.effects._base import AbstractEffect, Place, Scales, View, _times_of, register
 
 
 @register
@@ -34,8 +34,7 @@ class Aging(AbstractEffect):
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
     fingerprint: ClassVar[str] = (
-        "The residual is in proportion to the position, by a factor that grows slowly with the cycles and not with "
-        "the time."
+        "The residual is in proportion to the position, by a factor that grows ever more slowly, with cycles or time."
     )
     confusions: ClassVar[tuple[str, ...]] = (
         "thermal_gain",
@@ -112,6 +111,54 @@ class AgingOverRecords(AbstractEffect):
         """
         path = start.columns.get("path_V", _path_V(start.command.values))
         return _scaled(signal, self.gain_per_decade * jnp.log1p(path / self.cycle_V), self.zero_um)
+
+
+@register
+class AgingOverTime(AbstractEffect):
+    r"""A gain that changes along the logarithm of the time, as ceramics age after they were poled.
+
+    .. math:: w_0 + (w - w_0) (1 + a \log_{10}(1 + t / (t_0 e^b)))
+
+    Attributes
+    ----------
+    gain_per_decade
+        `a`: negative where the gain falls.
+    onset_s
+        `t0`, the time after which it has begun.
+    earlier
+        `b`: by how many e-folds it has begun earlier before a record than before others.
+    zero_um
+        `w0`, the displacement that stays, given.
+    """
+
+    name: ClassVar[str] = "aging"
+    form: ClassVar[str] = "over_time"
+    takes: ClassVar[str] = "um"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("gain_per_decade",)
+    history: ClassVar[tuple[str, ...]] = ("earlier",)
+    fingerprint: ClassVar[str] = Aging.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = Aging.confusions
+    experiment: ClassVar[str] = Aging.experiment
+    source: ClassVar[str] = "aging of poled ceramics along the logarithm of time; 0.1 to 2 % per decade (estimate)"
+    view: ClassVar[View] = "time"
+    column: ClassVar[str] = "temperature_degC"
+    gain_per_decade: Float[Array, ""] = param(unit="1", scale=1e-3)
+    onset_s: Float[Array, ""] = param(unit="s", lower=1e-4, upper=1e6)
+    earlier: Float[Array, ""] = param(default=0.0, unit="1")
+    zero_um: Float[Array, ""] = eqx.field(converter=_as_inexact, default=0.0)
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Onsets in decades, from a hundredth of the longest record to ten of it."""
+        onsets = (share * scales.duration_s for share in (0.01, 0.1, 1.0, 10.0))
+        return tuple((cls(jnp.asarray(1e-3), jnp.asarray(max(onset, 2e-4))),) for onset in onsets)
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Scale the displacement by what time has gone by since the first sample."""
+        passed = _times_of(time_s, signal.values.shape[0]) / (self.onset_s * jnp.exp(self.earlier))
+        return _scaled(signal, self.gain_per_decade * jnp.log1p(passed), self.zero_um)
 
 
 def _path_V(command_V: Float[Array, " t"]) -> Float[Array, " t"]:
