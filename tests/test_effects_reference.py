@@ -305,3 +305,13 @@ def test_noise_has_the_variance_that_is_said(rng):
     # Lost one after another they are off by more.
     np.testing.assert_allclose(said("repeated_readings", 0.03), np.var(held - smooth), rtol=0.2)
     assert said("floor_vibration", 0.2, 20.0, 10.0) == pytest.approx(0.04)
+
+
+def test_a_gain_ages_along_the_logarithm_of_the_time_since_it_began(rng):
+    time_s, push = np.sort(rng.uniform(0, 20, 300)), wander(rng, 300, 5, 30)
+    time_s -= time_s[0]
+    per_decade, onset_s, age_s, zero_um = -0.03, 0.4, 7.0, 2.0
+    more = per_decade * np.log10((age_s + time_s) / onset_s)
+    effect = BY_NAME["aging", "over_time"](per_decade, onset_s, np.log(age_s / onset_s), zero_um)
+    found = through(effect, time_s, push)
+    np.testing.assert_allclose(found, push + more * (push - zero_um), rtol=1e-12)

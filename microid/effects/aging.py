@@ -117,16 +117,16 @@ class AgingOverRecords(AbstractEffect):
 class AgingOverTime(AbstractEffect):
     r"""A gain that changes along the logarithm of the time, as ceramics age after they were poled.
 
-    .. math:: w_0 + (w - w_0) (1 + a \log_{10}(1 + t / (t_0 e^b)))
+    .. math:: w_0 + (w - w_0) (1 + a \log_{10}(e^b + t / t_0))
 
     Attributes
     ----------
     gain_per_decade
         `a`: negative where the gain falls.
     onset_s
-        `t0`, the time after which it has begun.
+        `t0`, how long ago it had begun at the first sample.
     earlier
-        `b`: by how many e-folds it has begun earlier before a record than before others.
+        `b`: how many e-folds longer ago that was before one record than before others.
     zero_um
         `w0`, the displacement that stays, given.
     """
@@ -157,8 +157,11 @@ class AgingOverTime(AbstractEffect):
 
     def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
         """Scale the displacement by what time has gone by since the first sample."""
-        passed = _times_of(time_s, signal.values.shape[0]) / (self.onset_s * jnp.exp(self.earlier))
-        return _scaled(signal, self.gain_per_decade * jnp.log1p(passed), self.zero_um)
+        passed = _times_of(time_s, signal.values.shape[0]) / self.onset_s
+        factor = self.gain_per_decade / jnp.log(10.0)
+        more = factor * (self.earlier + jnp.log1p(passed * jnp.exp(-self.earlier)))
+        before = signal.before + factor * self.earlier * (signal.before - self.zero_um)
+        return signal.with_values(signal.values + more * (signal.values - self.zero_um), before)
 
 
 def _path_V(command_V: Float[Array, " t"]) -> Float[Array, " t"]:
