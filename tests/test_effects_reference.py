@@ -48,6 +48,20 @@ def test_stiffness_hardening_is_duffings(rng, spacing):
     np.testing.assert_allclose(found, truth, atol=0.04 * np.max(np.abs(truth - plain)))
 
 
+def test_loops_narrow_along_the_path_of_the_command(rng):
+    model = random_model(rng)
+    law, (low, high) = model, (float(model.density.lower_V), float(model.density.upper_V))
+    path_V = np.r_[low, wander(rng, 400, low, high)]
+    given = through(law, 1e-3, path_V)
+    levels = np.linspace(low, high, 65)
+    up_down_up = through(law, 1e-3, np.r_[levels, levels[::-1], levels])
+    middle = (up_down_up[65:130][::-1] + up_down_up[130:]) / 2
+    moved_V = np.r_[0, np.cumsum(np.abs(np.diff(path_V)))]
+    wider = 0.2 * np.exp(-0.7 - moved_V / 150.0)
+    found = through(BY_NAME["accommodation", "narrowing"](law, 0.2, 150.0, 0.7), 1e-3, path_V)
+    np.testing.assert_allclose(found, given + wider * (given - np.interp(path_V, levels, middle)), atol=1e-9)
+
+
 def test_voltage_dependent_capacitance_is_a_changing_lag(rng):
     time, push = uneven(rng, 200, 2e-4), wander(rng, 200, 0, 100)
     truth = motion(time, push, lambda v, u: (2 * u - v) / (1e-3 * (1 + 0.4 * (v - 100) / 100)), 2 * push[:1])[:, 0]

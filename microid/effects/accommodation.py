@@ -1,4 +1,4 @@
-"""Accommodation: minor loops that are not congruent, as those of a moving Preisach model."""
+"""Accommodation: minor loops that are not congruent, as of a moving Preisach model, or narrow for some cycles."""
 
 from typing import Any, ClassVar, Self
 
@@ -76,3 +76,55 @@ class Accommodation(AbstractEffect):
 
         (values, before), _ = lax.scan(improve, (straight.values, straight.before), None, length=_PASSES + 1)
         return signal.with_values(values, before)
+
+
+@register
+class NarrowingLoops(AbstractEffect):
+    r"""Loops that narrow, or widen, in the first cycles, until they are closed.
+
+    .. math:: w = P + a e^{-b - s / s_0} (P - P_{an}(u)), \qquad s = \int |du|
+
+    Attributes
+    ----------
+    inner
+        The hysteresis `P`, as it comes to be.
+    wider
+        `a`: by which part loops are wider at first.
+    cycle_V
+        `s0`, the path of the command on which they approach that.
+    earlier
+        `b`: by how many e-folds loops have come nearer to it before one record than before others.
+    """
+
+    name: ClassVar[str] = "accommodation"
+    form: ClassVar[str] = "narrowing"
+    takes: ClassVar[str] = "V"
+    gives: ClassVar[str] = "um"
+    place: ClassVar[Place] = "hysteresis"
+    strength: ClassVar[tuple[str, ...]] = ("wider",)
+    history: ClassVar[tuple[str, ...]] = ("earlier",)
+    fingerprint: ClassVar[str] = Accommodation.fingerprint
+    confusions: ClassVar[tuple[str, ...]] = Accommodation.confusions
+    experiment: ClassVar[str] = Accommodation.experiment
+    source: ClassVar[str] = "accommodation of first cycles; a tenth of a loop within some cycles (estimate)"
+    inner: AbstractPart
+    wider: Float[Array, ""] = param(unit="1", scale=0.1)
+    cycle_V: Float[Array, ""] = param(unit="V", scale=100.0, lower=1e-3)
+    earlier: Float[Array, ""] = param(default=0.0, unit="1")
+
+    @classmethod
+    def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
+        """Paths of half a cycle, two and eight."""
+        if inner is None:
+            return ()
+        cycle = 2 * (scales.upper_V - scales.lower_V)
+        return tuple((cls(inner, jnp.asarray(0.1), jnp.asarray(share * cycle)),) for share in (0.5, 2.0, 8.0))
+
+    def run(self, time_s: Times, signal: Signal, start: Any = None) -> Signal:
+        """Add what loops are wider by."""
+        given, straight = self.inner.run(time_s, signal, start), _anhysteretic(self.inner, signal, start)
+        path = jnp.cumsum(jnp.abs(jnp.diff(signal.values, prepend=signal.before)))
+        more = self.wider * jnp.exp(-self.earlier - path / self.cycle_V)
+        values = given.values + more * (given.values - straight.values)
+        before = self.wider * jnp.exp(-self.earlier) * (given.before - straight.before)
+        return given.with_values(values, given.before + before)
