@@ -57,8 +57,8 @@ def test_loops_narrow_along_the_path_of_the_command(rng):
     up_down_up = through(law, 1e-3, np.r_[levels, levels[::-1], levels])
     middle = (up_down_up[65:130][::-1] + up_down_up[130:]) / 2
     moved_V = np.r_[0, np.cumsum(np.abs(np.diff(path_V)))]
-    wider = 0.2 * np.exp(-0.7 - moved_V / 150.0)
-    found = through(BY_NAME["accommodation", "narrowing"](law, 0.2, 150.0, 0.7), 1e-3, path_V)
+    wider = 0.2 * np.exp(-moved_V / 150.0)
+    found = through(BY_NAME["accommodation", "narrowing"](law, 0.2, 150.0), 1e-3, path_V)
     np.testing.assert_allclose(found, given + wider * (given - np.interp(path_V, levels, middle)), atol=1e-9)
 
 

@@ -82,7 +82,7 @@ class Accommodation(AbstractEffect):
 class NarrowingLoops(AbstractEffect):
     r"""Loops that narrow, or widen, in the first cycles, until they are closed.
 
-    .. math:: w = P + a e^{-b - s / s_0} (P - P_{an}(u)), \qquad s = \int |du|
+    .. math:: w = P + a e^{-s / s_0} (P - P_{an}(u)), \qquad s = \int |du|
 
     Attributes
     ----------
@@ -92,8 +92,6 @@ class NarrowingLoops(AbstractEffect):
         `a`: by which part loops are wider at first.
     cycle_V
         `s0`, the path of the command on which they approach that.
-    earlier
-        `b`: by how many e-folds loops have come nearer to it before one record than before others.
     """
 
     name: ClassVar[str] = "accommodation"
@@ -102,7 +100,6 @@ class NarrowingLoops(AbstractEffect):
     gives: ClassVar[str] = "um"
     place: ClassVar[Place] = "hysteresis"
     strength: ClassVar[tuple[str, ...]] = ("wider",)
-    history: ClassVar[tuple[str, ...]] = ("earlier",)
     fingerprint: ClassVar[str] = Accommodation.fingerprint
     confusions: ClassVar[tuple[str, ...]] = Accommodation.confusions
     experiment: ClassVar[str] = Accommodation.experiment
@@ -110,7 +107,6 @@ class NarrowingLoops(AbstractEffect):
     inner: AbstractPart
     wider: Float[Array, ""] = param(unit="1", scale=0.1)
     cycle_V: Float[Array, ""] = param(unit="V", scale=100.0, lower=1e-3)
-    earlier: Float[Array, ""] = param(default=0.0, unit="1")
 
     @classmethod
     def probes(cls, scales: Scales, inner: AbstractPart | None) -> tuple[tuple[Self, ...], ...]:
@@ -124,7 +120,7 @@ class NarrowingLoops(AbstractEffect):
         """Add what loops are wider by."""
         given, straight = self.inner.run(time_s, signal, start), _anhysteretic(self.inner, signal, start)
         path = jnp.cumsum(jnp.abs(jnp.diff(signal.values, prepend=signal.before)))
-        more = self.wider * jnp.exp(-self.earlier - path / self.cycle_V)
+        more = self.wider * jnp.exp(-path / self.cycle_V)
         values = given.values + more * (given.values - straight.values)
-        before = self.wider * jnp.exp(-self.earlier) * (given.before - straight.before)
+        before = self.wider * (given.before - straight.before)
         return given.with_values(values, given.before + before)
