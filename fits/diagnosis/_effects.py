@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from fits.io._record import Record
 from fits.io._threads import map_in_threads
 from fits.stage._motion import Prepared, at_samples, prepare, signals
 from fits.stage._run import fitted_past, place_of_hysteresis
-from microid import Coordinates, Sensor
+from microid import Coordinates, Sensor, Signal, Stage
 from microid.effects import AbstractEffect
 
 # Part of a period of the resonance between samples, beyond which a run does not resolve it.
@@ -25,6 +25,14 @@ _PERIOD = 0.25
 _PERIODS = 3
 # Part of a bound within which a coordinate is at it.
 _BOUND = 1e-2
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What a stage with effects makes of a run: what goes into each of its parts, and what comes out."""
+
+    stage: Stage
+    signals: Sequence[Signal]
 
 
 class Bench:
@@ -58,9 +66,18 @@ class Bench:
 
     def respond_in(self, run: int, effects: Sequence[AbstractEffect]) -> np.ndarray:
         """Simulate one run with effects; um, shape `(n,)`."""
+        return self.displacement_um(run, self.simulate_in(run, effects))
+
+    def simulate_in(self, run: int, effects: Sequence[AbstractEffect], near: Simulated | None = None) -> Simulated:
+        """Simulate one run with effects; parts ahead of the first that differs are as they were `near` it."""
         one = self.prepared[run]
         stage = with_effects(self.stage, self._seen(effects, one))
-        return at_samples(signals(stage, one, self.stage, self.known[run])[-1], one) - self._past_um[run]
+        near = Simulated(self.stage, self.known[run]) if near is None else near
+        return Simulated(stage, signals(stage, one, near.stage, near.signals))
+
+    def displacement_um(self, run: int, simulated: Simulated) -> np.ndarray:
+        """Displacement of a run that was simulated; um, shape `(n,)`."""
+        return at_samples(simulated.signals[-1], self.prepared[run]) - self._past_um[run]
 
     def _add_past(self, run: int, changed_um: np.ndarray) -> None:
         """Have a run simulated with its unknown past."""

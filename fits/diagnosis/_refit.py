@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fits.diagnosis._effects import Bench, Law, remembering, strength_of
+from fits.diagnosis._effects import Bench, Law, Simulated, remembering, strength_of
 from fits.diagnosis._orthonormal import orthonormal
 from fits.diagnosis._projector import Projector
 from fits.diagnosis._score import Scored, law_of
@@ -252,10 +252,13 @@ def fit_laws(
     # Per run, whether it depends on each of the coordinates.
     counts = [[k in law.places[run] for law in moving for k in range(law.size)] for run in range(runs)]
 
-    def change_in(run: int, flat: np.ndarray) -> np.ndarray:
+    def simulated_in(run: int, flat: np.ndarray, near: Simulated | None) -> Simulated:
         effects = [*fixed[run], *(law.effect(own, run) for law, own in zip(moving, parts(flat), strict=True))]
+        return bench.simulate_in(run, effects, near)
+
+    def change_in(run: int, simulated: Simulated) -> np.ndarray:
         # What runs away is as wrong as can be, and its square is still a number.
-        return np.clip(bench.respond_in(run, effects) - bench.plain[run], -_AWAY_um, _AWAY_um)
+        return np.clip(bench.displacement_um(run, simulated) - bench.plain[run], -_AWAY_um, _AWAY_um)
 
     def off(joined: np.ndarray) -> np.ndarray:
         moved = projector.off(joined)
@@ -265,14 +268,18 @@ def fit_laws(
         moved = aim - off(projector.join(change_um))
         return np.where(np.isfinite(moved), moved, 1e6)
 
-    def changes(flat: np.ndarray) -> list[np.ndarray]:
-        return map_in_threads(change_in, range(runs), [flat] * runs)
+    def simulated(flat: np.ndarray, near: Sequence[Simulated | None]) -> list[Simulated]:
+        return map_in_threads(simulated_in, range(runs), [flat] * runs, near)
 
     def slope() -> np.ndarray:
         at, raw = projector.join(at_um), np.empty((len(target), len(flat)))
         moves = [(run, k) for k in range(len(flat)) for run in range(runs) if counts[run][k]]
         steps = flat + STEP * np.eye(len(flat))
-        found = dict(zip(moves, map_in_threads(lambda move: change_in(move[0], steps[move[1]]), moves), strict=True))
+
+        def moved_um(run: int, k: int) -> np.ndarray:
+            return change_in(run, simulated_in(run, steps[k], here[run]))
+
+        found = dict(zip(moves, map_in_threads(lambda move: moved_um(*move), moves), strict=True))
         for k in range(len(flat)):
             raw[:, k] = (projector.join([found.get((run, k), um) for run, um in enumerate(at_um)]) - at) / STEP
         raw = np.where(np.isfinite(raw), raw, 0.0)
@@ -281,7 +288,8 @@ def fit_laws(
 
     aim = target - basis @ (basis.T @ target)
     flat = np.concatenate(list(x[held:]))
-    at_um = changes(flat)
+    here = simulated(flat, [None] * runs)
+    at_um = list(map(change_in, range(runs), here))
     residual = left(at_um)
     jacobian = slope() if rounds else np.zeros((len(residual), len(flat)))
     damping, farthest = 1e-3, _FARTHEST
@@ -297,10 +305,12 @@ def fit_laws(
             # No coordinate moves by more than a few e-folds at a time, or than less where that was too far, as near a
             # bound; one at its bound holds no other back. Cosine and sine of a line turn as its frequency moves.
             step = np.where(turning, step, np.clip(step, -farthest, farthest))
-            ahead_um = changes(flat + step)
+            ahead = simulated(flat + step, here)
+            ahead_um = list(map(change_in, range(runs), ahead))
             trial = left(ahead_um)
             if float(trial @ trial) < cost:
-                flat, at_um, residual, damping, moved = flat + step, ahead_um, trial, damping / 10, True
+                flat, here, at_um, residual = flat + step, ahead, ahead_um, trial
+                damping, moved = damping / 10, True
                 farthest = min(_SHORTER * farthest, _FARTHEST)
                 break
             damping *= 10
