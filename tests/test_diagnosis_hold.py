@@ -94,6 +94,16 @@ def test_a_delay_beside_lines_does_not_hide_steps_that_need_none():
     assert better_holds(("first", "zero"), table) == ("zero", "zero")
 
 
+def test_runs_that_go_apart_need_no_effect_to_explain_as_much():
+    """Ramps between levels looked like steps, and as steps left a shift of the readings that explained the rest."""
+    table = {("zero", "zero"): (20700.0, 0.0, 10770.0), ("first", "zero"): (9910.0, 0.0, 5.0)}
+    assert better_holds(("zero", "zero"), table) == ("first", "zero")
+    # They go alike where an effect explains more beside that.
+    table["zero", "zero"] = 32700.0, 0.0, 22770.0
+    table["first", "zero"] = 21900.0, 0.0, 12300.0
+    assert better_holds(("zero", "zero"), table) == ("zero", "zero")
+
+
 def test_curves_that_explain_what_an_effect_does_need_none():
     assert prefers("smooth", lines=9400, other=9010, late=0.0, best=400, best_after=10)
     assert prefers("smooth", lines=13801, other=13541, late=293, best=541, best_after=281)

@@ -175,11 +175,13 @@ class PlainFit:
         def shared(holds: Holds, by: Callable[[Holds], float] = gained) -> Holds:
             """The same with runs that do not show their own way going as the others do.
 
-            Of what more than noise is left in any way, a small part shows none.
+            Of what more than noise is left in any way, a small part shows none. What takes an effect to explain as
+            much as their own ways do without any is no simpler.
             """
             alike = max(((way,) * len(holds) for way in dict.fromkeys(holds)), key=by)
             own = max(least, off * (whole - len(self.left)))
-            return alike if by(alike) > by(holds) - own else holds
+            needs_more = gained(holds) > max(gained(alike) + own, (1 - off) * beside(alike))
+            return alike if by(alike) > by(holds) - own and not needs_more else holds
 
         if any(way == "zero" != own for way, own in zip(found, taken, strict=True)):
             # What only a delay beside it would be worth may hide what needs none.
