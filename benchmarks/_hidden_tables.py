@@ -36,6 +36,7 @@ SAME: dict[tuple[str, str], dict[str, Callable[[Row, Row], float]]] = {
     ("driver_saturation", ""): {
         "rail_V": lambda p, row: row["range_V"][1] - p["missing_share"] * (row["range_V"][1] - row["range_V"][0])
     },
+    ("driver_asymmetry", ""): {"asymmetry": _same("slower_share")},
     ("end_stop", ""): {"gain_beyond": lambda p, _: 1 / (1 + p["stiffness"])},
     ("floor_vibration", ""): {"frequency_Hz": _same("frequency_Hz")},
     ("friction", ""): {"amplitude_um": _same("force_um"), "length_um": _same("length_um")},

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.signal import lfilter
 
-from data_synth._effect import Effect, Place, Situation
+from data_synth._effect import Effect, Lag, Place, Situation
 from data_synth._mechanics import Mechanics, Mode
 from data_synth._plant import Plant, monotone_runs
 from data_synth._types import FloatArray, Hysteresis
@@ -132,7 +132,7 @@ def _apply(effects: Sequence[Acting], place: Place, signal: Any, situation: Situ
     return signal
 
 
-def _drive(command_V: FloatArray, tau_s: float | Callable[[float], float] | None, situation: Situation) -> FloatArray:
+def _drive(command_V: FloatArray, tau_s: Lag | None, situation: Situation) -> FloatArray:
     """The driver's voltage, shape (N,), in V, at rest before the first."""
     if tau_s is None:
         return command_V
@@ -148,7 +148,9 @@ def _drive(command_V: FloatArray, tau_s: float | Callable[[float], float] | None
     return command_V[0] + settled
 
 
-def _drive_stepwise(command_V: FloatArray, tau_s: Callable[[float], float], situation: Situation) -> FloatArray:
+def _drive_stepwise(
+    command_V: FloatArray, tau_s: Callable[[float, float], float], situation: Situation
+) -> FloatArray:
     step_s, straight = situation.step_s, situation.plant.hold == "first"
 
     def ahead(now_V: float, before_V: float, next_V: float, tau: float) -> float:
@@ -162,8 +164,9 @@ def _drive_stepwise(command_V: FloatArray, tau_s: Callable[[float], float], situ
     for next_V in command_V[1:].tolist():
         if not next_V == before_V == now_V:
             # The time constant of the middle of the step, where that would lead with the one of its beginning.
-            middle_V = (now_V + ahead(now_V, before_V, next_V, tau_s(now_V))) / 2
-            now_V = ahead(now_V, before_V, next_V, tau_s(middle_V))
+            asked_V = (before_V + next_V) / 2 if straight else next_V
+            middle_V = (now_V + ahead(now_V, before_V, next_V, tau_s(now_V, asked_V - now_V))) / 2
+            now_V = ahead(now_V, before_V, next_V, tau_s(middle_V, asked_V - middle_V))
         voltage_V.append(now_V)
         before_V = next_V
     return np.array(voltage_V)

@@ -4,8 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from _models import random_model
-from scipy import signal
+from scipy import interpolate, signal
 from test_effects_reference import BY_NAME, through, wander
+
+import microid as m
 
 
 def test_voltage_creep_is_what_a_controller_takes_back():
@@ -64,3 +66,44 @@ def test_walls_that_take_their_time(rng):
     walls = through(model, 1e-3, behind, before=command[0])
     slope = np.asarray(model.reversible(jnp.asarray(command)) - model.reversible(jnp.asarray(behind)))
     np.testing.assert_allclose(found, walls + slope, atol=1e-9)
+
+
+def test_plays_that_widen_with_the_rate_are_relays_that_do(rng):
+    """Each of the relays of a fine grid, its half-width wider by what the rate makes it."""
+    levels, low, high = 16, -10.0, 110.0
+    i, j = np.tril_indices(levels)
+    weights = (0.1 + rng.uniform(0, 1) * i + rng.uniform(0, 1) * j) * np.exp(-rng.uniform(0.05, 0.2) * (i - j))
+    model = m.Preisach(
+        m.densities.GridDensity(weights, low, high), m.Reversible(np.full(levels, 0.1), low, high), 0.0
+    )
+    command = wander(rng, 400, low + 5, high - 5)
+    gain, onset, late, fine = 0.3, 2000.0, 3e-3, 300
+    speed = np.abs(np.gradient(command, 1e-3))
+    _, slow, _ = signal.lsim(([1.0], [late, 1.0]), speed - speed[0], 1e-3 * np.arange(400))
+    wider = 1 + gain * np.log10(1 + (slow + speed[0]) / onset)
+    # One relay at random in each cell: those of an even grid would switch many at a time.
+    step, cells = (high - low) / fine, np.meshgrid(np.arange(fine), np.arange(fine), indexing="ij")
+    area = np.where(np.eye(fine, dtype=bool), 0.5, 1.0)[np.tril_indices(fine)] * step**2
+    up, down = (
+        low + step * (one[np.tril_indices(fine)] + rng.uniform(0, 1, fine * (fine + 1) // 2)) for one in cells
+    )
+    up, down = np.maximum(up, down), np.minimum(up, down)
+    nodes = np.asarray(model.density.nodes_um_per_V2())
+    # Bilinear, also across the diagonal, where the cells that it halves count half.
+    whole = nodes + np.tril(nodes, -1).T
+    grid = np.linspace(low, high, levels)
+    density = interpolate.RegularGridInterpolator((grid, grid), whole)(np.stack([up, down], axis=1))
+
+    def relays(factors):
+        centre, half = (up + down) / 2, (up - down) / 2
+        on, found = np.zeros(len(up), dtype=bool), []
+        for volts, factor in zip([command[0], *command], [1.0, *factors], strict=True):
+            on = np.where(volts >= centre + factor * half, True, np.where(volts <= centre - factor * half, False, on))
+            found.append(float((density * area)[on].sum()))
+        return np.array(found[1:])
+
+    expected = relays(wider) - relays(np.ones(400))
+    effect = BY_NAME["rate_dependence", "thresholds"](model, gain, onset, late)
+    found = through(effect, 1e-3, command) - through(model, 1e-3, command)
+    # Plays are some steps apart, where single samples are off by more.
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.04 * np.max(np.abs(expected))

@@ -72,7 +72,7 @@ def test_an_effect_is_as_strong_as_asked_and_nothing_at_strength_zero(name, seed
 
 
 def test_the_library_and_what_is_outside_of_it():
-    assert len(ds.EFFECTS) == 32
+    assert len(ds.EFFECTS) == 33
     assert not set(ds.EFFECTS) & set(ds.OUTSIDE)
     assert {"wandering_gain", "burst_disturbance", "memory_loss"} == set(ds.OUTSIDE)
 
@@ -198,8 +198,8 @@ def test_hardening_is_duffings_equation(rng):
 
 
 @pytest.mark.parametrize("hold", ["first", "zero"])
-def test_a_capacitance_that_changes_with_the_voltage_is_its_differential_equation(hold, rng):
-    tau_s, share, rate_Hz, steps = 1e-3, 0.8 * rng.choice([-1, 1]), 4000.0, 16
+def test_a_lag_that_changes_with_the_voltage_and_its_direction_is_its_differential_equation(hold, rng):
+    tau_s, share, slower, rate_Hz, steps = 1e-3, 0.8 * rng.choice([-1, 1]), rng.choice([0, 0.2]), 4000.0, 16
     command_V = 60 + 60 * np.sin(2 * np.pi * rng.uniform(100, 400) * np.arange(60) / rate_Hz + rng.uniform(0, 6))
     time_s = np.arange(59 * steps + 1) / (rate_Hz * steps)
     if hold == "first":
@@ -208,15 +208,18 @@ def test_a_capacitance_that_changes_with_the_voltage_is_its_differential_equatio
         fine_V = np.append(command_V[0], np.repeat(command_V[:-1], steps))
     situation = SimpleNamespace(step_s=time_s[1], plant=SimpleNamespace(hold=hold))
 
-    def of(voltage_V):
-        return tau_s * (1 + share * (voltage_V - 60) / 60)
+    def of(voltage_V, ahead_V):
+        return tau_s * (1 + share * (voltage_V - 60) / 60) * (1 + slower * np.sign(ahead_V))
+
+    def going(ahead_V, voltage_V):
+        return ahead_V / of(voltage_V, ahead_V)
 
     driven_V = _drive(fine_V, of, situation)
     expected_V, now_V = [command_V[0]], command_V[0]
     for k in range(59):
         way_V = command_V[k + 1] - command_V[k] if hold == "first" else 0.0
         solved = solve_ivp(
-            lambda t, v, k=k, way_V=way_V: (command_V[k] + way_V * t * rate_Hz - v) / of(v),
+            lambda t, v, k=k, way_V=way_V: going(command_V[k] + way_V * t * rate_Hz - v, v),
             (0, 1 / rate_Hz),
             [now_V],
             method="LSODA",

@@ -39,7 +39,12 @@ class VoltageDependentCapacitance(AbstractEffect):
     strength: ClassVar[tuple[str, ...]] = ("slope",)
     fast: ClassVar[bool] = True
     fingerprint: ClassVar[str] = "The residual is the velocity times a factor that changes with the bias."
-    confusions: ClassVar[tuple[str, ...]] = ("rate_dependence", "slew_limit", "stiffness_hardening")
+    confusions: ClassVar[tuple[str, ...]] = (
+        "rate_dependence",
+        "slew_limit",
+        "stiffness_hardening",
+        "driver_asymmetry",
+    )
     experiment: ClassVar[str] = "Small chirps at four biases, and a monitor of the piezo's voltage."
     source: ClassVar[str] = "Noliac tutorial on heat dissipation; 20 to 50 % over the unipolar range (estimate)"
     view: ClassVar[View] = "velocity"
