@@ -34,7 +34,8 @@ def named_beside(monkeypatch, parts, rest, harmful=(), unsure=(), helpful=(), un
         strength_z = [0.5 if name in unsure else 9.0 for name in names]
         even = [name not in uneven for name in names]
         each = {"strength_z": strength_z.__getitem__, "in_each_run": lambda which, *_: all(even[k] for k in which)}
-        return SimpleNamespace(cost=cost(names), change_um=errors, **each)
+        laws = [SimpleNamespace(size=1) for _ in names]
+        return SimpleNamespace(cost=cost(names), change_um=errors, laws=laws, **each)
 
     def without(found, name):
         return model([cause.name for cause in found.causes if cause.name != name])
@@ -71,6 +72,17 @@ def test_what_the_rest_may_make_is_not_named(monkeypatch):
     assert named_beside(monkeypatch, {"creep": 90.0}, chance + 2500.0) == ["creep"]
     hum = {"creep": 8000.0, "mains_hum": 90.0}
     assert named_beside(monkeypatch, hum, chance + 2500.0, helpful=["creep"]) == ["creep", "mains_hum"]
+
+
+def test_what_is_small_beside_the_noise_is_named_only_where_it_predicts_or_is_beyond_doubt(monkeypatch):
+    """A tenth of the noise was named at 4.9 standard deviations: forty plays, that are on no grid."""
+    assert named_beside(monkeypatch, {"backlash": 24.0}, 40.0) == []
+    assert named_beside(monkeypatch, {"backlash": 24.0}, 40.0, helpful=["backlash"]) == ["backlash"]
+    assert named_beside(monkeypatch, {"backlash": 70.0}, 40.0) == ["backlash"]
+    # What the others explain as well, but for chance, is none, whatever it predicts.
+    parts = {"creep": 8000.0, "backlash": 12.0}
+    assert named_beside(monkeypatch, parts, 40.0, helpful=[*parts]) == ["creep"]
+    assert named_beside(monkeypatch, {**parts, "backlash": 24.0}, 40.0, helpful=[*parts]) == [*parts]
 
 
 def test_beside_what_is_left_a_cause_is_named_only_where_it_predicts(monkeypatch):

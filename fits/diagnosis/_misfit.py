@@ -16,6 +16,7 @@ from fits.io._length import length
 from fits.stats._compare import improvement_z, is_worse
 from fits.stats._cycles import Cycles
 from fits.stats._noise import Noise
+from fits.stats._score_test import standard_deviations
 from microid.effects import card_of
 
 _WANDERS = (
@@ -142,22 +143,26 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     strength_z = max(map(found.model.strength_z, laws))
     if card.independent and not found.model.in_each_run(laws, thresholds.minor_share, thresholds.apart_z):
         return -np.inf, name, "it would be in some runs and not in others, and what depends on no command is in all"
-    if alone and strength_z >= 1:
-        return None
     fewer = _without(found, name)
-    before, after = (found.projector.held_out(model.change_um) for model in (fewer, found.model))
-    if strength_z < 1 and improvement_z(before, after) < thresholds.worse_z:
-        return -np.inf, name, "its strength may be none, and nothing that was held out is predicted better with it"
-    if alone:
-        return None
-    if is_worse(before, after, thresholds.worse_z, thresholds.model_error):
-        worse = float(np.sum(after**2) - np.sum(before**2))
-        return -worse, name, "what was held out is predicted worse with it than with the other causes alone"
     explained = fewer.cost - found.model.cost
     # A hum has another phase in the next run, and nothing else is like it.
     small = explained < thresholds.rest_noise**2 * misfit.count and not card.independent
+    apart_z = float(standard_deviations(explained, sum(found.model.laws[k].size for k in laws)))
+    if alone and strength_z >= 1 and (not small or apart_z > thresholds.strong_z):
+        return None
+    before, after = (found.projector.held_out(model.change_um) for model in (fewer, found.model))
+    if strength_z < 1 and improvement_z(before, after) < thresholds.worse_z:
+        return -np.inf, name, "its strength may be none, and nothing that was held out is predicted better with it"
+    if not alone and is_worse(before, after, thresholds.worse_z, thresholds.model_error):
+        worse = float(np.sum(after**2) - np.sum(before**2))
+        return -worse, name, "what was held out is predicted worse with it than with the other causes alone"
     if small and improvement_z(before, after) < thresholds.worse_z:
         why = "it is small beside the noise, and nothing that was held out is predicted better with it"
+        return -1 / max(explained, 1e-300), name, why
+    if alone:
+        return None
+    if small and apart_z < thresholds.apart_z:
+        why = "it is small beside the noise, and the other causes alone explain as much, but for chance"
         return -1 / max(explained, 1e-300), name, why
     # Beside a rest of another kind any evidence looks large; of what one run had of its own others say nothing.
     alike = misfit.is_left_over and not (card.independent or card.per_run)
