@@ -65,8 +65,8 @@ def test_a_fit_that_cannot_come_near_enough_is_left(rng, monkeypatch):
     case = made(rng, lambda bench, _: [um + 0.02 * np.tanh(3 * (um - um.mean()) / np.ptp(um)) for um in bench.plain])
     plain = nothing(case.bench, case.projector)
     best = max(score(case.projector, asked(case, "creep"), plain.residual).each, key=lambda one: one.z)
-    costs, calls, respond = [], [], case.bench.respond_in
-    monkeypatch.setattr(case.bench, "respond_in", lambda *each: calls.append(each) or respond(*each))
+    costs, calls, respond = [], [], case.bench.simulate_in
+    monkeypatch.setattr(case.bench, "simulate_in", lambda *each: calls.append(each) or respond(*each))
     for enough in (np.inf, plain.cost, 0.0):
         calls.append(None)
         costs.append((refit_beside(case.bench, case.projector, plain, best, enough).cost, len(calls)))
