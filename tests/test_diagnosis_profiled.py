@@ -104,16 +104,22 @@ def test_what_shows_well_is_not_followed(rng):
     assert value == pytest.approx(5.0, abs=5 * sd)
 
 
+def bench_of(count, respond):
+    """A bench of one run, whose effects are a function of their own."""
+    return SimpleNamespace(
+        prepared=[None],
+        plain=[np.zeros(count)],
+        simulate_in=lambda run, own, near: respond(own),
+        displacement_um=lambda run, simulated: simulated,
+    )
+
+
 def test_a_fit_finds_its_way_from_near_a_bound():
     # Here a Gauss-Newton step, cut to the farthest that is allowed, goes beyond the optimum to where all is worse.
     column = np.linspace(-1e3, 1e3, 50)
     form = next(one for one in EFFECTS if one.name == "voltage_dependent_capacitance")
     law = Law([form(Driver(1e-3), jnp.asarray(0.886), jnp.zeros(()), jnp.ones(()))])
-    bench = SimpleNamespace(
-        prepared=[None],
-        plain=[np.zeros(50)],
-        respond_in=lambda run, own: float(own[0].slope) * column,
-    )
+    bench = bench_of(50, lambda own: float(own[0].slope) * column)
     projector = SimpleNamespace(residual=0.8 * column, off=lambda joined: joined, join=lambda signals: signals[0])
     found = refit(bench, projector, [law], [law.start])
     assert float(law.effect(found.x[0], 0).slope) == pytest.approx(0.8, abs=1e-3)
@@ -124,13 +130,13 @@ def test_a_line_turns_its_amplitudes_as_its_frequency_is_found(rng):
     time_s, phase = np.arange(4000) / 500, rng.uniform(0, 2 * np.pi)
     wave = 2 * np.pi * 50.025 * time_s + phase
 
-    def lines(run, own):
+    def lines(own):
         turns = 2 * np.pi * float(own[0].frequency_Hz) * time_s * np.arange(1, 4)[:, None]
         return np.asarray(own[0].cosine_um) @ np.cos(turns) + np.asarray(own[0].sine_um) @ np.sin(turns)
 
     start = np.array([0.4 * np.cos(phase + 1.0), 0.0, 0.0]), np.array([-0.4 * np.sin(phase + 1.0), 0.0, 0.0])
     law = Law([MainsHum(*map(jnp.asarray, start), jnp.asarray(50.008))])
-    bench = SimpleNamespace(prepared=[None], plain=[np.zeros(4000)], respond_in=lines)
+    bench = bench_of(4000, lines)
     noise = 0.06 * rng.standard_normal(4000)
     projector = SimpleNamespace(
         residual=(0.4 * np.cos(wave) + noise) / 0.06, off=lambda joined: joined, join=lambda um: um[0] / 0.06
@@ -145,11 +151,7 @@ def at_slope(value, truth):
     column = np.linspace(-1e3, 1e3, 50)
     form = next(one for one in EFFECTS if one.name == "voltage_dependent_capacitance")
     law = Law([form(Driver(1e-3), jnp.asarray(value), jnp.zeros(()), jnp.ones(()))])
-    bench = SimpleNamespace(
-        prepared=[None],
-        plain=[np.zeros(50)],
-        respond_in=lambda run, own: float(own[0].slope) * column,
-    )
+    bench = bench_of(50, lambda own: float(own[0].slope) * column)
     projector = SimpleNamespace(residual=truth * column, off=lambda joined: joined, join=lambda signals: signals[0])
     return bench, projector, refit(bench, projector, [law], [law.start], 0)
 
@@ -185,11 +187,7 @@ def test_a_parameter_alone_in_its_effect_is_followed_with_the_other_effects_fitt
     second = first**3 / 25
     laws = [Law([form(Driver(1e-3), jnp.asarray(slope), jnp.zeros(()), jnp.ones(()))]) for slope in (0.85, 0.3)]
     assert [law.size for law in laws] == [1, 1]
-    bench = SimpleNamespace(
-        prepared=[None],
-        plain=[np.zeros(50)],
-        respond_in=lambda run, own: float(own[0].slope) * first + float(own[1].slope) * second,
-    )
+    bench = bench_of(50, lambda own: float(own[0].slope) * first + float(own[1].slope) * second)
     measured = 0.85 * first + 0.3 * second
     projector = SimpleNamespace(residual=measured, off=lambda joined: joined, join=lambda signals: signals[0])
     model = refit(bench, projector, laws, [law.start for law in laws])
