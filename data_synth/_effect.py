@@ -31,7 +31,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 POSITIVE = (0.0, math.inf)
 
-Lag: TypeAlias = float | Callable[[float, float], float]
+TimeConstant: TypeAlias = float | Callable[[float, float], float]
 """A driver's time constant (s), or what that is at a voltage of the piezo, so far (V) behind the command."""
 
 # Of anything that an effect counts.

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.signal import lfilter
 
-from data_synth._effect import Effect, Lag, Place, Situation
+from data_synth._effect import Effect, Place, Situation, TimeConstant
 from data_synth._mechanics import Mechanics, Mode
 from data_synth._plant import Plant, monotone_runs
 from data_synth._types import FloatArray, Hysteresis
@@ -132,7 +132,7 @@ def _apply(effects: Sequence[Acting], place: Place, signal: Any, situation: Situ
     return signal
 
 
-def _drive(command_V: FloatArray, tau_s: Lag | None, situation: Situation) -> FloatArray:
+def _drive(command_V: FloatArray, tau_s: TimeConstant | None, situation: Situation) -> FloatArray:
     """The driver's voltage, shape (N,), in V, at rest before the first."""
     if tau_s is None:
         return command_V

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from data_synth._effect import POSITIVE, Lag, Situation, effect
+from data_synth._effect import POSITIVE, Situation, TimeConstant, effect
 from data_synth._types import FloatArray
 
 
@@ -29,12 +29,14 @@ def driver_saturation(command_V: FloatArray, run: Situation, *, missing_share: f
     return np.minimum(command_V, rail_V)
 
 
-def _at(time_constant_s: Lag, voltage_V: float, ahead_V: float) -> float:
+def _at(time_constant_s: TimeConstant, voltage_V: float, ahead_V: float) -> float:
     return time_constant_s(voltage_V, ahead_V) if callable(time_constant_s) else time_constant_s
 
 
 @effect("driver", "change_share", usual=0.3, limit=0.8, needs="driver")
-def voltage_dependent_capacitance(time_constant_s: Lag, run: Situation, *, change_share: float) -> Lag:
+def voltage_dependent_capacitance(
+    time_constant_s: TimeConstant, run: Situation, *, change_share: float
+) -> TimeConstant:
     """The time constant is `1 + change_share x` of the plant's, x from -1 at the lower voltage to 1 at the upper."""
     middle_V = (run.rig.lower_V + run.rig.upper_V) / 2
     half_V = (run.rig.upper_V - run.rig.lower_V) / 2
@@ -46,7 +48,7 @@ def voltage_dependent_capacitance(time_constant_s: Lag, run: Situation, *, chang
 
 
 @effect("driver", "slower_share", usual=0.1, limit=0.8, needs="driver", between={"slower_share": (-1.0, 1.0)})
-def driver_asymmetry(time_constant_s: Lag, run: Situation, *, slower_share: float) -> Lag:
+def driver_asymmetry(time_constant_s: TimeConstant, run: Situation, *, slower_share: float) -> TimeConstant:
     """The time constant is `1 + slower_share` of the plant's while the voltage rises, `1 - slower_share` else."""
 
     def tau_s(voltage_V: float, ahead_V: float) -> float:

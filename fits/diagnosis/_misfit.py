@@ -151,12 +151,13 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
     if alone and strength_z >= 1 and (not small or apart_z > thresholds.strong_z):
         return None
     before, after = (found.projector.held_out(model.change_um) for model in (fewer, found.model))
-    if strength_z < 1 and improvement_z(before, after) < thresholds.worse_z:
+    better_z = improvement_z(before, after)
+    if strength_z < 1 and better_z < thresholds.worse_z:
         return -np.inf, name, "its strength may be none, and nothing that was held out is predicted better with it"
     if not alone and is_worse(before, after, thresholds.worse_z, thresholds.model_error):
         worse = float(np.sum(after**2) - np.sum(before**2))
         return -worse, name, "what was held out is predicted worse with it than with the other causes alone"
-    if small and improvement_z(before, after) < thresholds.worse_z:
+    if small and better_z < thresholds.worse_z:
         why = "it is small beside the noise, and nothing that was held out is predicted better with it"
         return -1 / max(explained, 1e-300), name, why
     if alone:
@@ -166,7 +167,7 @@ def _doubt(found: Selection, name: str, misfit: Misfit) -> tuple[float, str, str
         return -1 / max(explained, 1e-300), name, why
     # Beside a rest of another kind any evidence looks large; of what one run had of its own others say nothing.
     alike = misfit.is_left_over and not (card.independent or card.per_run)
-    if alike and improvement_z(before, after) < thresholds.worse_z / 2:
+    if alike and better_z < thresholds.worse_z / 2:
         why = (
             "something else is left, and what was held out is predicted no better with it than with the other causes"
         )
